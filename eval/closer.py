@@ -187,7 +187,7 @@ def _of_photograph(
     return looks
 
 
-def compared(looks: Sequence[JudgedLook], folds: int) -> str:
+def compare(looks: Sequence[JudgedLook], folds: int) -> str:
     """Write the table of all rules.
 
     Args:
@@ -290,7 +290,7 @@ def judge(config: CloserConfig) -> None:
     """Search the photographs, judge closer looks by all rules, and write the table."""
     run = Looking(config)
     model = make_searching(config.search_model, run.eye)
-    write_outputs(config, compared(judged_looks(run, model, config), config.folds), {})
+    write_outputs(config, compare(judged_looks(run, model, config), config.folds), {})
 
 
 main = command(judge, CloserConfig, __doc__)

@@ -204,20 +204,23 @@ BELIEF = by_word(
         "belief.class_probabilities(), or belief.probability(target)": (
             "logits mean posterior posteriors prob probs softmax"
         ),
-        "semfov.dirichlet.entropy(belief.beta), or that of belief.class_probabilities()": "entropy uncertainty",
+        "belief.class_probabilities(), or semfov.dirichlet.entropy(belief.beta) of a Dirichlet belief": (
+            "entropy uncertainty"
+        ),
         "observer(belief, detections, fixation, grid), which returns the new belief": "fuse observe step update",
         "belief.map(lambda tensor: tensor.to(device))": "cpu cuda double float half to",
     }
 )
 
-MODEL = by_word(
+MODEL = by_word({"model.save(path)": "export save_pretrained"})
+"""Of models that are fitted and saved."""
+
+OBSERVATION_MODEL = MODEL | by_word(
     {
-        "model.save(path)": "export save_pretrained",
         "len(model.classes)": "n_classes nc num_classes",
         "model.classes": "class_names labels names",
     }
 )
-"""Of models that are fitted and saved."""
 
 POLICIES = by_word({"semfov.policies.policy_names(task)": "POLICIES all available known list list_policies names"})
 

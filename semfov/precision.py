@@ -11,7 +11,7 @@ def without_autocast(like: Tensor) -> AbstractContextManager[object]:
 
     Automatic mixed precision computes them with 8 significant bits. A log likelihood is a sum of terms of hundreds of
     nats, in which that is an error of a nat or two: enough for another class to be the most probable one.
-    Of a picture they would leave two digits.
+    A picture would keep two digits.
 
     Args:
         like: a tensor on the device of the products.

@@ -62,7 +62,7 @@ OPTIONS = by_word(
         "picture": "file image img input path photo source",
         "grid": "cells columns rows",
         "name": "detector",
-        "passed": "delta dt elapsed timestamp",
+        "passed": "delta dt elapsed",
         "detector name": "model yolo",
         "model": "models",
         "models model": "checkpoint ckpt",
@@ -255,7 +255,7 @@ _OTHER_METHODS = {
     ("gaze", "people"): _OF_VIEWERS,
     ("gaze", "seconds"): _OF_VIEWERS,
     **dict.fromkeys(
-        [("gaze", "areas"), ("describe", "areas"), ("describe", "target")],
+        [("gaze", "areas"), ("describe", "areas")],
         "gaze.share(areas) and gaze.visits(areas) are of a prediction",
     ),
     ("scanpaths", "shifts"): "seconds= says how long a viewer looks",

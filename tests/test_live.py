@@ -393,7 +393,6 @@ def test_a_stream_says_how_it_is_called():
     live = agent_with(Semantic(3)).live("green")
     refused(r"live\.step\(frame\) takes its frames", live, scene(8))
     refused("did you mean passed=", live.step, scene(8), dt=0.1)
-    refused("did you mean passed=", live.step, scene(8), timestamp=0.1)
     with pytest.raises(AttributeError, match=r"use a new agent\.live\(target\)"):
         _ = live.reset
     moment = agent_with(Semantic(3)).live("green", how="windows").step(scene(8))

@@ -342,7 +342,7 @@ class _WindowsOfPicture(PictureEpisode[ZoomPath]):
     def looks(self) -> tuple[LookAtWindow, ...]:
         return tuple(self._looks)
 
-    def _recorded(self, look: KeptLook) -> LookAtWindow:
+    def _record_look(self, look: KeptLook) -> LookAtWindow:
         """Keep a look as the record has it."""
         recorded = look_at_window(look.original, self.source.lattice, look.number, look.seconds, look.value)
         self._looks.append(recorded)
@@ -386,7 +386,7 @@ class WindowEpisode(_WindowsOfPicture):
         decisions = self.session.decisions
         if decisions.outcome and decisions.candidate is None:
             self.ending = decisions.ending
-        return self._recorded(look)
+        return self._record_look(look)
 
     def _end(self, limit: Ending | None) -> None:
         decisions = self.session.decisions
@@ -448,7 +448,7 @@ class GivenWindows(_WindowsOfPicture):
         self._next = window or self._next
         look = self.session.look()
         assert look is not None
-        return self._recorded(look)
+        return self._record_look(look)
 
     def _end(self, limit: Ending | None) -> None:
         self.ending = limit

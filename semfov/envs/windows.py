@@ -112,6 +112,7 @@ class WindowGaze(Gazes[_WindowEpisode]):
         closeness = adaptive_max_pool2d(self._closeness(), self.shape)  # (1, Y, X)
         return torch.cat([probability, closeness]).clamp(0, 1).numpy()[None]
 
+    @torch.no_grad()
     def _expected_objects(self) -> Tensor:
         """Compute how many objects a closer look is expected to find in each place of the planes, `(1, Y, X)`."""
         lattice = self.source.lattice
@@ -120,7 +121,7 @@ class WindowGaze(Gazes[_WindowEpisode]):
         expected = torch.zeros(lattice.rows, lattice.columns)
         if lattice.levels > 1:
             # Level 0 is the whole picture, which was looked at first.
-            by_level = [belief.expected(level).detach() for level in range(1, lattice.levels)]
+            by_level = [belief.expected(level) for level in range(1, lattice.levels)]
             expected = torch.stack(by_level).amax(0)  # (rows, columns) of the lattice
         # Objects of each place: the mean of its cells times their number.
         rows, columns = self.shape

@@ -361,7 +361,7 @@ def fit_certainty(model: GlimpseEvidence, fitted: PicturesByKind, judged: Pictur
     training = [exploration for group in by_kind.values() for exploration in group]
     held_out = [exploration for group in explorations_of_kinds(model, judged, passes).values() for exploration in group]
     certainty, report_on_spread = fit_with_spread(by_kind, partial(_fit_certainty, passes=passes))
-    model.certainty = certainty
+    model.certainty = certainty.requires_grad_(False)
     facts, right = _judged(held_out, passes)
     chances = certainty.probability(facts).detach()
     is_listed = chances >= 0.5

@@ -96,6 +96,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise DataError(f"cannot write {path}: {error.strerror or error}") from error
     finally:
         with suppress(OSError):
+            temporary.chmod(0o600)  # Windows removes no file that may only be read
             temporary.unlink()
         _unfinished.discard(temporary)
 
@@ -269,6 +270,7 @@ def check_writable(path: Path | None, *, folder: bool = False) -> None:
     """
     if path is None:
         return
+    path = Path(os.path.realpath(path))  # behind a link the file is written that it points to
     place = next((ancestor for ancestor in (path, *path.parents) if ancestor.exists()), Path())
     if place == path and not folder:
         check_regular(path)

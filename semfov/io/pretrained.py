@@ -37,6 +37,7 @@ class Pretrained(StatedModule):
         shipped: folder of the models that are shipped with the package.
         schema: requirements of a file.
         data: options of `semfov fit` that name what the module is fitted to.
+        other_words: words of other libraries, with ours.
         metadata: JSON values kept with the model.
     """
 
@@ -45,6 +46,7 @@ class Pretrained(StatedModule):
     shipped: ClassVar[Path]
     schema: ClassVar[Schema]
     data: ClassVar[str] = "--data.root PHOTOS --data.annotations instances.json"
+    other_words: ClassVar[Mapping[str, str]] = MODEL
     metadata: JsonObject
 
     @abstractmethod
@@ -71,8 +73,8 @@ class Pretrained(StatedModule):
 
     def __getattr__(self, name: str) -> Any:
         """Find a part of the module; words of other libraries are refused with ours."""
-        if name in MODEL:
-            raise missing(f"a {self.title}", name, MODEL)
+        if name in self.other_words:
+            raise missing(f"this {self.title}", name, self.other_words)
         return super().__getattr__(name)
 
     def digest(self) -> str:

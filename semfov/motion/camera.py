@@ -248,14 +248,14 @@ class CameraMotion:
         has_stood = self._stands_still
         if has_stood and not scene.has_moved and self._stays(scene, present):
             return Motion.still()
-        fitted, fit = self._fit_to_key_or_last(scene, present)
+        scene_of_fit, fit = self._fit_to_key_or_last(scene, present)
         self._stands_still = not scene.has_moved and self._shows_no_drift(scene.key, present, fit, has_stood=has_stood)
         if self._stands_still:
             return Motion.still()
         if fit is None:
             self._scene = _Scene.of(present)
             return Motion.still() if self._is_same(scene.last, present) else None
-        return self._by_fit(fitted, present, fit, has_stood=has_stood)
+        return self._by_fit(scene_of_fit, present, fit, has_stood=has_stood)
 
     def _by_fit(self, scene: _Scene, present: GreyFrame, fit: _Fit, *, has_stood: bool) -> Motion | None:
         """Judge a fitted motion, and keep it, or doubt it and begin anew at the present frame.
@@ -288,7 +288,7 @@ class CameraMotion:
             self._scene = scene._replace(last=present)
             self._stands_still = True
             return Motion.still()
-        self._scene = _moved(scene, fit.similarity, since_last.similarity, present)
+        self._scene = _move(scene, fit.similarity, since_last.similarity, present)
         return _at_full_size(since_last.similarity, present.ratio)
 
     def _shows_no_drift(self, unmoved: GreyFrame, present: GreyFrame, fit: _Fit | None, *, has_stood: bool) -> bool:
@@ -425,7 +425,7 @@ class CameraMotion:
         return False
 
 
-def _moved(
+def _move(
     scene: _Scene, key_to_present: NDArray[np.float64], last_to_present: NDArray[np.float64], present: GreyFrame
 ) -> _Scene:
     """Move on by a believed motion; a frame that shows little of the anchor begins anew.

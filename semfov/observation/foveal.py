@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semfov.attribute_words import OBSERVATION_MODEL
 from semfov.detection.detector import Detector
 from semfov.errors import InputError, check, check_finite, check_shape, check_tensor, lookup, values_known
 from semfov.io import compatibility
@@ -94,6 +95,7 @@ class FovealObservationModel(Pretrained):
     kind: ClassVar[str] = "foveal-observation-model"
     title: ClassVar[str] = "observation model"
     shipped: ClassVar[Path] = Path(__file__).parent / "models"
+    other_words: ClassVar[Mapping[str, str]] = OBSERVATION_MODEL
     schema: ClassVar[Schema] = Schema(
         {
             "log_alpha": Field(("K+1", "N", "K+1"), low=-30, high=30),

@@ -236,9 +236,9 @@ class Outcome(ABC):
     def objects(self) -> Objects:
         """The candidates of the targets that have at least the score `score_threshold`, or that were confirmed.
 
-        One that was confirmed has the box that confirmed it, and that box's probability where it is higher than a score
-        that is no probability. A search that did not find its target lists none: `best_place` is where the target is
-        most likely.
+        One that was confirmed has the box that confirmed it, unless that shows a part of it, and that box's probability
+        where it is higher than a score that is no probability. A search that did not find its target lists none:
+        `best_place` is where the target is most likely.
         """
         return self._outcome[0]
 
@@ -408,7 +408,8 @@ class _Listing:
     Args:
         candidates: the candidates of the classes that were searched for.
         score_threshold: score from which on a candidate counts.
-        are_probable: whether scores are probabilities by all looks, closer ones too, which no prior changes.
+        are_probable: whether scores are probabilities by all looks, closer ones too, which no prior changes. An added
+            place has the probability of its closer look.
     """
 
     def __init__(self, candidates: Objects, score_threshold: float, *, are_probable: bool) -> None:

@@ -244,7 +244,7 @@ def mistake(message: str, config: type[CheckedSettings], options: Iterable[str],
         return _unknown_argument(unknown[1], options, help_option)
     setting = _unknown_setting(message)
     if setting is not None:
-        return f"unknown setting {setting!r}; {_remedy_for(setting, options, help_option)}"
+        return f"unknown setting {setting!r} in a file; {_remedy_for(setting, options, help_option)}"
     return _mistaken_value(message, config)
 
 
@@ -264,14 +264,16 @@ def _mistaken_value(message: str, config: type[CheckedSettings]) -> str:
     unread = re.match(r"Parser key \"([\w.]+)\":\s+Unable to load config '(.*?)'", message, re.DOTALL)
     if unread and ", line " not in message:  # a mistake in the file has its line
         group, file = unread.groups()
-        return f"{_in_messages(group)}: no file of settings: {file}; check the path"
+        reason = "expected a file of settings by name, got" if os.path.exists(file) else "no file of settings:"
+        return f"{_in_messages(group)}: {reason} {file}; check the path"
     setting = re.search(r'Parser key "([\w.]+)"', message)
     value = re.search(r"(?:Given|Got) value: (.*)", message)
     if setting and value:
         name = setting[1]
         kind = setting_types(config).get(name, _NO_SETTING)
-        refusal = _refusal(kind, value[1].strip()) or f"expected what --help says of it, got {value[1].strip()}"
-        return f"{_in_messages(name)}: {refusal}"
+        refusal = _refusal(kind, value[1].strip())
+        if refusal is not None:
+            return f"{_in_messages(name)}: {refusal}"
     return " ".join(message.split())
 
 

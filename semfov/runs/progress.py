@@ -153,11 +153,14 @@ class _LinesOfLog:
 
     def __init__(self, log: TextIO) -> None:
         self._log = log
+        self._last = ""  # the last drawing, which is drawn again when a bar is closed
 
     def write(self, text: str) -> None:
         """Write a drawing as a line; what only moves the cursor is left out."""
         line = text.strip()
-        if line and line.isprintable():
+        is_drawing = line and "\x1b" not in line
+        if is_drawing and line != self._last:
+            self._last = line
             self._log.write(f"{line}\n")
 
     def flush(self) -> None:

@@ -7,9 +7,10 @@ what is left to explore there, and what closer looks are expected to find there.
                                                         ├──► sums over windows ──► `value`    objects that a look finds
     explored windows ──► `unexplored` ──────────────────┘    (`window_sums`)
 
-All of it are tensors on one device. A gradient of a value reaches the networks that predict the rates, and the weights
-of the border; what was first asked for under `torch.no_grad`, as policies do, is a constant. Nothing is computed until
-it is asked for, and then only what has changed:
+All of it are tensors on one device. Where the evidence is trained and the belief begins with gradients, those of a
+value reach the networks that predict the rates, and the weights of the border, whatever a policy asks for without
+gradients in between. Such a belief serves one backward pass. Nothing is computed until it is asked for, and then only
+what has changed:
 
 - `_gists_rated` is the number of gists whose rates are written to the cells; `_predict` writes those of the others.
 - `_sums` remember in which cells they have fallen behind (`mark`), and catch up in `update`. Whoever changes
@@ -29,7 +30,7 @@ from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.survey import STEPS
-from semfov.zoom.window_sums import CellBox, Cells, CellSlices, WindowSums, extent, lasting
+from semfov.zoom.window_sums import CellBox, Cells, CellSlices, WindowSums, extent, writable_tensor
 
 # Fainter rates promise mostly where nothing is, so they are summed apart.
 _CLEAR = 0.1  # expected number of objects from which on a cell clearly promises one
@@ -114,19 +115,20 @@ class ZoomBelief:
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         self.foresight = self._rates.foresight
         self._targets = torch.tensor([target], device=device)
+        self._learns = torch.is_grad_enabled() and self._rates.taper(1).requires_grad
         self.gists: list[Gist] = []
         self._predictions: dict[int, _Prediction] = {}
         self.clear()
 
     def clear(self) -> None:
         """Forget all looks; what they predict is kept for those that are added again before the next `clear`."""
-        known = self._predictions
+        known = {} if self._learns else self._predictions  # a graph serves one backward pass
         self._predictions = {id(gist): known[id(gist)] for gist in self.gists if id(gist) in known}
         shape = self.lattice.rows, self.lattice.columns
         self._rate: dict[int, Cells] = {}
         self._gists_rated = 0
-        self._rated_level = lasting(shape, -1, torch.int8, self._targets.device)
-        self.closest_level = lasting(shape, -1, torch.int8, self._targets.device)
+        self._rated_level = writable_tensor(shape, -1, torch.int8, self._targets.device)
+        self.closest_level = writable_tensor(shape, -1, torch.int8, self._targets.device)
         # Made anew when it is asked for: which cells are blank is known after the overview alone.
         self.__dict__.pop("unexplored", None)
         self.gists = []
@@ -219,8 +221,9 @@ class ZoomBelief:
         """Write the rates of new looks to the cells that were not looked at as closely before."""
         new = self.gists[self._gists_rated :]
         self._gists_rated = len(self.gists)
-        for gist in new:
-            self._write_rates(gist)
+        with torch.set_grad_enabled(self._learns):
+            for gist in new:
+                self._write_rates(gist)
 
     def _write_rates(self, gist: Gist) -> None:
         """Write the rates of a look to the cells that were not looked at as closely before."""
@@ -236,7 +239,7 @@ class ZoomBelief:
             octave = level - gist.level - 1
             if 0 <= octave < STEPS:
                 if level not in self._rate:
-                    self._rate[level] = lasting(self._rated_level.shape, 0, by_cell.dtype, by_cell.device)
+                    self._rate[level] = writable_tensor(self._rated_level.shape, 0, by_cell.dtype, by_cell.device)
                 rate = self._rate[level][cells]
                 rate.copy_(torch.where(is_closer, by_cell[octave], rate))
             elif level in self._rate:
@@ -339,15 +342,18 @@ class ZoomBelief:
 
     def _equal_weight(self, span: int) -> Tensor:
         """Weight the cells along a side of a window alike, `(span,)`."""
-        return torch.ones_like(self._rates.taper(span))
+        return self._rates.taper(1).detach().new_ones(span)
 
     def _sum_over_windows(self, quantity: _CellQuantity, level: int, weight: Callable[[int], Tensor]) -> Cells:
         """Sum a quantity of the cells over the windows of a level; → `(down, across)`."""
         if (quantity, level) not in self._sums:
-            weights = weight(self.lattice.span(level))
+            with torch.set_grad_enabled(self._learns):
+                weights = weight(self.lattice.span(level))
             shape = self.lattice.rows, self.lattice.columns
             self._sums[quantity, level] = WindowSums(weights, shape, partial(quantity, level))
-        return self._sums[quantity, level].update()
+        with torch.set_grad_enabled(self._learns):
+            sums = self._sums[quantity, level].update()
+        return sums if torch.is_grad_enabled() else sums.detach()
 
 
 def _by_cell(predicted: Cells, scale: int, shape: tuple[int, ...]) -> Cells:

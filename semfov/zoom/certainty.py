@@ -53,7 +53,7 @@ class Certainty(StatedModule):
     .. math:: R = R_1 + w R_2, \qquad E[c] = \frac{k c_0 + F}{k + u W}, \qquad
               E[n] = E[c] R, \qquad \operatorname{Var}[n] = E[c] R + \frac{E[c] R^2}{k + u W}
 
-    Both are differentiable in the numbers of the fit, which are parameters.
+    Both are differentiable in the numbers of the fit but the spread, which are parameters.
 
     Args:
         offset: constant of the regression.
@@ -65,7 +65,7 @@ class Certainty(StatedModule):
         spread: standard deviation of the share by which the model is off in a picture (`number_of`).
 
     Raises:
-        InputError: there are more or fewer weights than facts.
+        InputError: there are more or fewer weights than facts, or the strength is not positive.
 
     >>> certainty = Certainty(0.0, [1.0] + 13 * [0.0])  # by the score alone
     >>> certainty.probability(torch.zeros(2, 14)).tolist()
@@ -84,6 +84,7 @@ class Certainty(StatedModule):
     ) -> None:
         super().__init__()
         check(len(weights) == len(FACTS), "weights", f"{len(FACTS)} numbers", len(weights))
+        check(strength > 0, "strength", "a number above 0", strength)
         self.offset = _parameter(offset)
         self.weights = _parameter(weights)
         self.scale = _parameter(scale)
@@ -169,7 +170,10 @@ def _parameter(numbers: float | Sequence[float]) -> nn.Parameter:
 
 def _decimals(parameters: Sequence[Tensor]) -> list[float]:
     """List parameters `()` by the shortest decimals that are rounded to them: 0.1 in float32 is 0.1."""
-    return [float(str(number)) for number in torch.stack([*parameters]).detach().cpu().numpy()]
+    numbers = torch.stack([*parameters]).detach().cpu()
+    if numbers.dtype == torch.bfloat16:
+        numbers = numbers.float()  # NumPy has no such type
+    return [float(str(number)) for number in numbers.numpy()]
 
 
 BY_SCORE = Certainty.of([0.0, 1.0]).requires_grad_(False)

@@ -43,7 +43,7 @@ def best_find(
     lattice = belief.lattice
     best: WindowChoice | None = None
     for level in range(1, lattice.levels):
-        values = belief.value(level, foresight).cpu().numpy()
+        values = belief.value(level, foresight).detach().cpu().numpy()
         if known is not None:
             values = values + known(level)
         best = _better(best, values, level, lattice, done, beside)

@@ -12,6 +12,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from semfov.precision import without_autocast
+
 _BLOCK = 1024  # windows along a side that are summed by one product
 
 Cells = Tensor
@@ -55,7 +57,7 @@ def enclosing(first: CellBox | None, second: CellBox) -> CellBox:
 
 
 @torch.inference_mode(False)
-def lasting(shape: tuple[int, ...], value: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+def writable_tensor(shape: tuple[int, ...], value: float, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Make a tensor of one value that may be written to in every mode of PyTorch, whichever it is now.
 
     Args:
@@ -142,14 +144,16 @@ class WindowSums:
         if self._is_empty:
             if cells is None:
                 return
-            self._sums = lasting(self._sums.shape, 0, self._sums.dtype, self._sums.device)
+            self._sums = writable_tensor(self._sums.shape, 0, self._sums.dtype, self._sums.device)
             self._is_empty = False
         self._sums[top:bottom, left:right] = 0 if cells is None else self._summed(cells, bottom - top, right - left)
 
     def _summed(self, cells: Cells, down: int, across: int) -> Tensor:
         """Sum cells over the windows that start at the first rows and columns, `(down, across)`."""
-        row_sums = self._sums_of_rows(cells, across)
-        return torch.cat([self._band[: len(part), :count].mT @ part for count, part in self._blocks(row_sums, down)])
+        with without_autocast(cells):
+            row_sums = self._sums_of_rows(cells.to(self._band), across)
+            blocks = self._blocks(row_sums, down)
+            return torch.cat([self._band[: len(part), :count].mT @ part for count, part in blocks])
 
     def _sums_of_rows(self, cells: Tensor, across: int) -> Tensor:
         """Sum the cells of each row over the columns of windows, `(rows, across)`."""

@@ -201,7 +201,7 @@ def test_areas_are_told_drawn_and_in_the_table(run, photos, tmp_path):
     assert out.count(share) == 1
     assert f"left {percent}" in page.read_text(encoding="utf-8")
     seen = f"{100 * float(rows[0]['viewers of left']):.0f} %"
-    assert f"{share}{seen} of viewers, first " in out
+    assert f"{share}{seen} of viewers, by these first after " in out
     assert f"<td>left</td><td>{percent}</td><td>{seen}</td>" in page.read_text(encoding="utf-8")
     assert 0 <= float(rows[0]["seconds to left"]) < 3
     (tmp_path / "areas.json").write_text('{"top": [0, 0, 80, 45], "left": [0, 0, 40, 90]}')

@@ -302,11 +302,11 @@ def test_a_file_that_has_a_setting_by_two_names_is_refused(text, tmp_path, capsy
     [
         ("search", "detector: [a]", "detector: expected a name, got \"['a']\""),
         ("search", "report: [x]", "report: expected the name of a file or folder, got \"['x']\""),
-        ("search", "pases: 4", "unknown setting 'pases'; did you mean --passes?"),
-        ("search", "1: x", "unknown setting '1'; --help-all lists all options"),
+        ("search", "pases: 4", "unknown setting 'pases' in a file; did you mean --passes?"),
+        ("search", "1: x", "unknown setting '1' in a file; --help-all lists all options"),
         ("fit", "data: [3]", "data: expected settings by name, or a file of them, got [3]"),
         ("fit", "data: {1: x}", "data: expected settings by name, or a file of them, got {1: 'x'}"),
-        ("fit", "data: {rot: x}", "unknown setting 'data.rot'; did you mean --data.root?"),
+        ("fit", "data: {rot: x}", "unknown setting 'data.rot' in a file; did you mean --data.root?"),
         ("fit", "data: none.yaml", "data: no file of settings: none.yaml; check the path"),
     ],
 )
@@ -344,8 +344,8 @@ def test_a_file_whose_name_begins_with_a_dash_is_no_option(name, tmp_path, monke
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("data.yaml", "limt: 3\n", "unknown setting 'data.limt'; did you mean --data.limit?\n"),
-        ("data.json", '{"limt": 3}', "unknown setting 'data.limt'; did you mean --data.limit?\n"),
+        ("data.yaml", "limt: 3\n", "unknown setting 'data.limt' in a file; did you mean --data.limit?\n"),
+        ("data.json", '{"limt": 3}', "unknown setting 'data.limt' in a file; did you mean --data.limit?\n"),
         ("data.yaml", "root: photographs\nlimit: [3\nids: 4\n", "line 3, column 4"),
         ("data.yaml", b"root: \xff\n", "expected --data.root, --data.annotations and others, or a file of them"),
         ("data.csv", "limit: 3\n", "or a file of them (.yaml, .json), got "),

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from eval.closer import JudgedLook, chain_at_place, chain_in_cells, compared
+from eval.closer import JudgedLook, chain_at_place, chain_in_cells, compare
 from semfov import DataError, Detections
 from semfov.belief.grid import Grid
 from tests.small import search_model
@@ -76,7 +76,7 @@ def test_the_table_compares_each_rule_with_the_verification():
     # In each of the four folds half of the places are right.
     rights = [number // 4 % 2 == 0 for number in range(40)]
     looks = [judged(number, right, 3.0 if right else -3.0) for number, right in enumerate(rights)]
-    lines = compared(looks, 4).splitlines()
+    lines = compare(looks, 4).splitlines()
     assert lines[0] == "40 closer looks in 40 photographs; the rules are fitted to other folds."
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
     rows = {row[0]: row[1:] for row in cells[2:]}
@@ -89,4 +89,4 @@ def test_the_table_compares_each_rule_with_the_verification():
 
 def test_closer_looks_of_one_kind_are_refused():
     with pytest.raises(DataError, match="expected closer looks at places that hold the target and at others"):
-        compared([judged(number, True, 1.0) for number in range(4)], 2)
+        compare([judged(number, True, 1.0) for number in range(4)], 2)

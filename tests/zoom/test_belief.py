@@ -214,6 +214,47 @@ def test_gradients_of_values_reach_the_network_and_the_border(source):
     torch.testing.assert_close(slope, (sides[0] - sides[1]) / 2e-5, rtol=1e-5, atol=0)
 
 
+def gradients_of_a_value(belief, looks, *, with_policy):
+    """Gradients of the last value of a belief in the network, after looks between which a policy may ask."""
+    values = torch.zeros(())
+    for look in looks:
+        belief.add(look)
+        if with_policy:
+            with torch.no_grad():
+                best_find(belief, set(), 0.5)
+                belief.remaining()
+        else:
+            belief.value(1, 0.5)
+        values = belief.value(1, 0.5).sum()
+    return torch.autograd.grad(values, [*belief.evidence.rate.parameters()])
+
+
+def test_what_a_policy_asks_for_in_between_changes_no_gradient(source):
+    torch.manual_seed(3)
+    evidence = GlimpseEvidence(3).eval()
+    looks = some_looks(source, torch.clone)
+    belief = ZoomBelief(source.lattice, evidence, 1)
+    plain = gradients_of_a_value(belief, looks, with_policy=False)
+    assert any(gradient.any() for gradient in plain)
+    belief.clear()  # and the graph of one backward pass is not used for the next one
+    for anew in (belief, ZoomBelief(source.lattice, evidence, 1)):
+        again = gradients_of_a_value(anew, looks, with_policy=True)
+        for gradient, expected in zip(again, plain, strict=True):
+            torch.testing.assert_close(gradient, expected)
+
+
+def test_values_are_exact_under_automatic_mixed_precision(source, evidence):
+    belief, mixed = (ZoomBelief(source.lattice, evidence, 1) for _ in range(2))
+    for look in some_looks(source, torch.clone):
+        belief.add(look)
+        mixed.add(look)
+        belief.expected(1)
+        mixed.expected(1)
+        with torch.autocast("cpu", torch.bfloat16):
+            value = mixed.value(1, 0.5)
+        assert torch.equal(value, belief.value(1, 0.5))
+
+
 def test_a_belief_is_on_the_device_of_its_looks(source, evidence, device):
     lattice = source.lattice
     plain_belief = ZoomBelief(lattice, evidence, 1)
@@ -232,8 +273,10 @@ def test_a_belief_is_on_the_device_of_its_looks(source, evidence, device):
     assert [window for window, _ in chosen] == [window for window, _ in expected]
 
 
-def test_a_belief_that_began_in_inference_mode_goes_on_outside(source, evidence):
+@pytest.mark.parametrize("learns", [False, True])
+def test_a_belief_that_began_in_inference_mode_goes_on_outside(source, evidence, learns):
     lattice = source.lattice
+    evidence = copy.deepcopy(evidence).requires_grad_(learns)
     first, *others = some_looks(source, torch.clone)
     with torch.inference_mode():
         belief = ZoomBelief(lattice, evidence, 1)
