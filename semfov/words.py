@@ -255,7 +255,8 @@ _OTHER_METHODS = {
     ("gaze", "people"): _OF_VIEWERS,
     ("gaze", "seconds"): _OF_VIEWERS,
     **dict.fromkeys(
-        [("gaze", "areas"), ("describe", "areas")],
+        # What is given to `describe` without a name is taken for a target.
+        [("gaze", "areas"), ("describe", "areas"), ("describe", "target")],
         "gaze.share(areas) and gaze.visits(areas) are of a prediction",
     ),
     ("scanpaths", "shifts"): "seconds= says how long a viewer looks",
