@@ -491,7 +491,7 @@ def test_a_file_keeps_the_numbers_of_a_certainty(tmp_path):
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
     assert not any(name.startswith("certainty") for name in read(tmp_path / "a.safetensors", evidence.kind)[0])
     # A state has them too, the spread among them.
-    other = Certainty.of([0.0] * 20)
+    other = Certainty.of([1.0] * 20)
     other.load_state_dict(certainty.state_dict())
     assert other.numbers == numbers
     refused("certainty: expected 2 or 20 numbers, got 3", Certainty.of, [1.0, 2.0, 3.0])
