@@ -2,8 +2,8 @@
 # # A belief in ten lines
 #
 # A detector is often wrong in blurred parts of a picture, and its scores are not calibrated probabilities. A belief
-# gathers its detections from several fixations: a Dirichlet over the classes for every cell of a grid. This tutorial
-# computes such a belief step by step, and then shows the module that does the same.
+# gathers the detections from several fixations in a Dirichlet distribution over the classes for every cell of a grid.
+# This tutorial computes a belief step by step, and then shows the module that does the same.
 
 # %%
 import matplotlib.pyplot as plt
@@ -34,10 +34,10 @@ for axis, picture, (x, y) in zip(axes, eye.foveated(view, fixations), fixations.
 # %% [markdown]
 # ## The ten lines
 #
-# The scores of a detection are a point of the simplex: scores of background and of all classes, which sum to 1. The
-# observation model has the distribution of such scores for each class and distance to the fovea, and turns scores into
-# likelihoods of the classes. Kaplan's rule fuses these likelihoods into the Dirichlets of the cells that the box
-# overlaps. If several boxes overlap a cell, the most confident detection comes first.
+# A detection has scores for background and for all classes, which sum to 1. The observation model describes the
+# distribution of these scores for each class and distance to the fovea, and turns scores into likelihoods of the
+# classes. Kaplan's rule fuses the likelihoods into the Dirichlets of the cells that the detection's box overlaps. If
+# several boxes overlap a cell, the most confident detection is fused first.
 
 # %%
 beta = torch.full((len(grid), 81), 0.5)  # a flat prior for every cell
@@ -51,9 +51,9 @@ for fixation in fixations:
     beliefs.append(beta.clone())
 
 # %% [markdown]
-# The mean of its Dirichlet gives the class probabilities of a cell. Here is the probability of a person after each look.
-# A flat prior of 0.5 for each of 81 classes weighs as much as forty looks, so the probability rises slowly. What matters
-# is which class has the largest probability.
+# The mean of a cell's Dirichlet gives the cell's class probabilities. The figure shows the probability of a person
+# after each look. A flat prior of 0.5 for each of 81 classes weighs as much as forty looks, so the probability rises
+# slowly. What matters is which class has the largest probability.
 
 # %% alt="The photograph in grey with the probability of a person in each cell, after each of four looks"
 person = detector.classes.index("person") + 1  # 0 is background
@@ -78,8 +78,8 @@ for label, leader in zip(scene.labels.tolist(), leaders.tolist()):
 # %% [markdown]
 # ## The module that does the same
 #
-# `semfov.observers.Semantic` computes this belief for batches of episodes, and for all detections of a look at once.
-# It gives the same numbers.
+# `semfov.observers.Semantic` computes the same belief, to the same numbers, for batches of episodes, and for all
+# detections of a look at once.
 
 # %%
 observer = semfov.observers.Semantic(81, model)

@@ -44,8 +44,8 @@ show(pictures, list(kinds))
 # %% [markdown]
 # ## Another look is cheap
 #
-# The pyramid does not depend on the fixation. A module keeps its settings, and you can build the pyramid once for any
-# number of looks.
+# The pyramid does not depend on the fixation, so you can build it once for any number of looks. The module
+# `semfov.Foveation` keeps the settings.
 
 # %%
 sensor = semfov.Foveation(50.0, growth=1.0)
@@ -56,8 +56,8 @@ print(sensor(bands, fixations).shape)  # eight looks
 # %% [markdown]
 # ## Recover an unknown fixation
 #
-# Foveation is differentiable in the picture, in σ and in the fixation. So gradient descent can find a fixation. Suppose
-# that we have the view from an unknown fixation. We start at the centre and move the gaze until our view is the same.
+# Foveation is differentiable in the picture, in σ and in the fixation. So gradient descent can find the unknown
+# fixation of a given view. We start at the centre and move the gaze until our view equals the given view.
 
 # %%
 unknown = torch.tensor([300.0, 120.0])

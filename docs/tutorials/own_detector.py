@@ -117,8 +117,8 @@ _ = axes[0].legend()
 # %% [markdown]
 # ## Search with it
 #
-# An agent is an eye with an observer and a policy. With its own observation model it gives the scores of a blurred coin
-# the right weight.
+# An agent is an eye with an observer and a policy. The observation model that we fitted gives the scores of a blurred
+# coin the right weight.
 
 # %% alt="The scanpath over the coins to a large one, with the foveated view and the probability of large coins at each fixation"
 observer = semfov.observers.Semantic(3, model)

@@ -77,6 +77,6 @@ axis.grid(alpha=0.3)
 _ = axis.legend()
 
 # %% [markdown]
-# These are four photographs. For meaningful figures, name the
-# registered policy in the settings of `eval.explore` and measure it on photographs. [Write your own
-# policy](../guides/write_your_own_policy.md) shows how to do this, for a search policy.
+# Four photographs are too few for meaningful figures. To measure the policy, register it, name it in the settings of
+# `eval.explore`, and run this study on many photographs. [Write your own policy](../guides/write_your_own_policy.md)
+# shows these steps for a search policy.

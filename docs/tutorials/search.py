@@ -23,9 +23,9 @@ viz.plot_episode(scanpath)
 #
 # ## The decision
 #
-# A search has one of three outcomes. `found` comes with a cell and a box. Before it, the agent looks closely at the
-# place: it enlarges a window around the box to the detector's input. The decision has two probabilities: that the
-# photograph holds the target anywhere, and that the target is at this place.
+# A search has one of three outcomes. The outcome `found` comes with a cell and a box. Before the agent says `found`, it
+# looks closely at the place: it enlarges a window around the box to the detector's input. The decision has two
+# probabilities: that the photograph holds the target anywhere, and that the target is at this place.
 
 # %%
 decision = scanpath.decision
