@@ -204,11 +204,8 @@ def _check_groups(values: Mapping[object, object], types: Mapping[str, SettingTy
     for key, value in values.items():
         name = f"{prefix}{key}"
         hint = types.get(name, _NO_SETTING).hint
-        if (
-            value is None
-            or isinstance(value, str)
-            or not (isinstance(hint, type) and issubclass(hint, CheckedSettings))
-        ):
+        is_group = isinstance(hint, type) and issubclass(hint, CheckedSettings)
+        if not is_group or value is None or isinstance(value, str):
             continue
         if not isinstance(value, dict) or not all(isinstance(inner, str) for inner in value):
             raise InputError(f"{_in_messages(name)}: expected settings by name, or a file of them, got {value!r}")

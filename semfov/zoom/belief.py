@@ -22,7 +22,7 @@ from functools import cached_property, partial
 from typing import NamedTuple, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence
@@ -84,7 +84,8 @@ class ZoomBelief:
     Private attributes: `_rate` has λ of each cell `(rows, columns)` by the level of looks, where any cell has one, and
     `_rated_level` `(rows, columns)` the level of the look that this is from. `_gists_rated` counts the gists that both
     know. `_sums` has the sums over windows that were asked for, by quantity and level. `_predictions` has what looks
-    predict, by the `id` of their gists: of present ones, and of those before the last `clear`.
+    predict, by the `id` of their gists: of present ones, and of those before the last `clear`. `_learns` tells whether
+    rates and sums keep their graph, in whichever mode they are asked for.
 
     Invariant: `closest_level` knows all gists, `_rate` and `_rated_level` the first `_gists_rated`; when these are all,
     `_rated_level` equals `closest_level`. The sums are those of the cells but for windows over cells that were marked.
@@ -115,7 +116,7 @@ class ZoomBelief:
         self._rates: Rates = evidence.survey if target == 0 and isinstance(evidence, GlimpseEvidence) else evidence
         self.foresight = self._rates.foresight
         self._targets = torch.tensor([target], device=device)
-        self._learns = torch.is_grad_enabled() and self._rates.taper(1).requires_grad
+        self._learns = torch.is_grad_enabled() and _is_trained(self._rates)
         self.gists: list[Gist] = []
         self._predictions: dict[int, _Prediction] = {}
         self.clear()
@@ -346,14 +347,18 @@ class ZoomBelief:
 
     def _sum_over_windows(self, quantity: _CellQuantity, level: int, weight: Callable[[int], Tensor]) -> Cells:
         """Sum a quantity of the cells over the windows of a level; → `(down, across)`."""
-        if (quantity, level) not in self._sums:
-            with torch.set_grad_enabled(self._learns):
-                weights = weight(self.lattice.span(level))
-            shape = self.lattice.rows, self.lattice.columns
-            self._sums[quantity, level] = WindowSums(weights, shape, partial(quantity, level))
         with torch.set_grad_enabled(self._learns):
+            if (quantity, level) not in self._sums:
+                weights = weight(self.lattice.span(level))
+                shape = self.lattice.rows, self.lattice.columns
+                self._sums[quantity, level] = WindowSums(weights, shape, partial(quantity, level))
             sums = self._sums[quantity, level].update()
         return sums if torch.is_grad_enabled() else sums.detach()
+
+
+def _is_trained(rates: Rates) -> bool:
+    """Tell whether what predicts the rates has parameters that gradients are to reach."""
+    return isinstance(rates, nn.Module) and any(parameter.requires_grad for parameter in rates.parameters())
 
 
 def _by_cell(predicted: Cells, scale: int, shape: tuple[int, ...]) -> Cells:

@@ -229,9 +229,11 @@ def gradients_of_a_value(belief, looks, *, with_policy):
     return torch.autograd.grad(values, [*belief.evidence.rate.parameters()])
 
 
-def test_what_a_policy_asks_for_in_between_changes_no_gradient(source):
+@pytest.mark.parametrize("learns_border", [True, False])
+def test_what_a_policy_asks_for_in_between_changes_no_gradient(source, learns_border):
     torch.manual_seed(3)
     evidence = GlimpseEvidence(3).eval()
+    evidence.border.requires_grad_(learns_border)
     looks = some_looks(source, torch.clone)
     belief = ZoomBelief(source.lattice, evidence, 1)
     plain = gradients_of_a_value(belief, looks, with_policy=False)
