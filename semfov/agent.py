@@ -60,21 +60,21 @@ _Targets = str | int | Sequence[str | int] | None  # a class by name or index, s
 
 
 class ActivePerception(MovableModule):
-    """An agent that looks at any picture, to find a target, to find all objects, or to learn what is where.
+    """An agent that looks at any picture to search for a target, to find all objects, or to map what is where.
 
-    The picture decides how the agent looks (`how="auto"`): at windows of a flat picture, the first of them the whole
-    (`windows`), or with eye and head in a scene such as a `semfov.Panorama` (`head`). `how="fovea"` moves the gaze of a
-    fovea over the cells of a photograph, as in the paper; without evidence for photographs, `auto` does so where the
-    picture is less than four times as long as the detector's input. `record.how` says which it was.
+    By default (`how="auto"`) the agent looks at a flat picture through windows, first at the whole picture (`windows`),
+    and at a scene such as a `semfov.Panorama` with eye and head (`head`). `how="fovea"` moves a fovea over the cells of
+    a photograph, as in the paper. If the agent has no evidence for photographs, `auto` does so for pictures less than
+    four times as long as the detector's input. `record.how` has the kind that was used.
 
     Args:
         eye: sensor and detector.
         search: observer and policy for search.
         explore: observer and policy for exploration; during a search this observer keeps the map of all classes.
-        verification: probabilities after closer looks (`semfov.belief.Verification`); None searches without them.
-        windows: evidence for windows (`semfov.zoom.GlimpseEvidence`); None looks at slices in the overview's order.
+        verification: probabilities after closer looks (`semfov.belief.Verification`); None: no closer looks.
+        windows: evidence for windows (`semfov.zoom.GlimpseEvidence`); None: slices, by their scores in the overview.
         grid: `(columns, rows)` of the belief, 1 to 200 each.
-        photographs: whether windows also suit photographs; where their evidence knows photographs, they always do.
+        photographs: whether to look at photographs, too, through windows; always if the evidence was fitted to them.
 
     Raises:
         InputError: `grid` is out of range, or a model was fitted for another detector, sensor or grid.
@@ -141,19 +141,19 @@ class ActivePerception(MovableModule):
     def from_pretrained(cls, name: str | PathLike[str] = "yolox-nano", **options: Any) -> Self:
         """Load the agent from a folder that `semfov.fit_detector` wrote, or the recommended agent for a detector.
 
-        The file of one model, such as `python -m train.fit_search` writes it, gives the recommended agent with that
-        model in place of the shipped one.
+        From the file of one model, as `python -m train.fit_search` writes it, this makes the recommended agent with
+        that model instead of the shipped one.
 
         Args:
             name: the folder, the file of a model, or the name of a detector as for `recommended`.
             options: options of `recommended`; for a folder, of `semfov.model_folder.ModelFolder.load_detector`; for a
-                file, `detector=` where it is not the one that its model was fitted to by name.
+                file, `detector=`, the detector that its model was fitted to, if its name does not suffice.
 
         Returns:
             The agent, in `eval` mode and without gradients.
 
         Raises:
-            InputError: it is no folder, and no models are shipped for the name; the message has the commands for both.
+            InputError: there is no such folder, and no models are shipped for a detector of this name.
             DataError: a file is missing or damaged, or the detector is not the one that the models were fitted to.
         """
         if is_model_file(name):
@@ -171,14 +171,13 @@ class ActivePerception(MovableModule):
         calibrated: bool = True,
         **options: Any,
     ) -> Self:
-        """Make the agent of Luzio, Bernardino and Moreno (2024), with one of the small detectors with shipped models.
+        """Make the agent of Luzio, Bernardino and Moreno (2024), with a small detector for which models are shipped.
 
         It has 10 x 10 cells with a uniform prior of 0.5. Kaplan's rule updates every cell that a box overlaps, with
         scores calibrated by Dirichlets of maximum likelihood. Exploration maximises the Kullback-Leibler divergence.
-        The paper does not give the widths of its wide and its narrow fovea; ours are 100 and 50 pixels of 640. It does
-        not give a score threshold either. Ours is 0.02; for `threshold=` 0.1, 0.25 and 0.5 the wide fovea has models
-        that are fitted at them. Its detector is YOLOv3, larger than ours. With a folder of models, detector, sensor,
-        grid and observation model are those of the folder.
+        The paper states neither the widths of its two foveas nor a score threshold: ours are 100 and 50 pixels of 640,
+        and 0.02. For the wide fovea there are also models for `threshold=` 0.1, 0.25 and 0.5. The paper's detector,
+        YOLOv3, is larger. If `name` is a folder of models, detector, sensor, grid and observation model come from it.
 
         Args:
             name: a detector that models are shipped for, `yolox-nano` or `yolov3-tiny`, or a folder of models.
@@ -200,7 +199,7 @@ class ActivePerception(MovableModule):
     def raw(cls, name: DetectorLike = "yolox-nano", *, sensor: str = "published", **options: Any) -> Self:
         """Make an agent for any detector, without fitted models: raw scores as likelihoods, and random exploration.
 
-        It looks at photographs by windows, too: raw scores of a fovea's looks make no probability.
+        It looks at every flat picture through windows, photographs included.
 
         Args:
             name: name, path or model of the detector, as for `semfov.load_detector`.
@@ -303,7 +302,7 @@ class ActivePerception(MovableModule):
             picture: as for `search`, or one that is opened.
             how: `auto` chooses by the picture; another kind is returned, if it suits the picture.
             every: whether all objects are wanted.
-            foveal: whether a fovea is asked for: by several classes, a first cell, gaze shifts or true boxes.
+            foveal: whether other settings need a fovea: several classes, a first cell, gaze shifts or true boxes.
 
         Returns:
             `fovea`, `windows` or `head`.
@@ -340,29 +339,29 @@ class ActivePerception(MovableModule):
     ) -> Record:
         """Search a picture for a target class, and decide whether it is there (`record.decision`).
 
-        The recommended agent looks closely at places that seem to hold the target: it enlarges a window around them to
-        the detector's input (`semfov.decision.Verifier`). The search ends with `found` when the target is probable
-        enough at such a place. It ends without the target when no remaining look is worth a pass, and at the first
-        limit that is reached.
+        If a place seems to hold the target, the recommended agent takes a closer look: it enlarges a window around the
+        place to the detector's input (`semfov.decision.Verifier`). The search ends with `found` when the target is
+        probable enough at such a place. Otherwise it ends when no further look is worth a pass, or when a limit is
+        reached.
 
         Without closer looks the search ends with `found` when the picture holds the target with enough probability, and
         a fixated cell is nearly as probable as the most probable one (`semfov.decision.decide`).
 
-        By Kaplan's rule, which has no calibrated thresholds, a search never gives up. It finds the target when a
-        detection that overlaps the fixated cell has it as its best class, with a score of at least `confirm`.
+        An agent without calibrated thresholds, such as `published`, never gives up. It finds the target when a
+        detection on the fixated cell has the target as its best class, with a score of at least `confirm`.
 
-        With `boxes`, as in the paper, the search makes no decision. It ends with the gaze on a cell that a box meets.
+        With `boxes`, as in the paper, the search makes no decision: it ends with the gaze on a cell that a box meets.
 
         Args:
             picture: a picture of any common kind and size (`semfov.as_image`): a path, a Pillow image, an array or a
                 tensor; a `semfov.data.windowed.LargePicture`; or a scene: a `semfov.Panorama`, a
                 `semfov.Flat`, or a camera that turns (`semfov.head.PanTiltCamera`).
-            target: class by name or index 1..K. A fovea also takes several: with `how="fovea"` in a list, of which any
-                will do, or each with the probability that it is meant (`AnyOf`, `semfov.data.spread`). The target of
-                the record is then the most probable of them.
+            target: class by name or index 1..K. With `how="fovea"` also several: a list of classes, any of which will
+                do, or a mapping from each to the probability that it is meant (`AnyOf`, `semfov.data.spread`). The
+                target of the record is then the most probable class.
             color: order of the channels of arrays and tensors, `rgb`, or `bgr` as OpenCV reads them.
             white: the value that is white where 0 is black, `(black, white)`, or `auto` for percentiles (`read_image`).
-            bands: bands of a TIFF or a raster that are red, green and blue, from 1, or one as grey; None: as named.
+            bands: numbers of a TIFF's red, green and blue band, from 1, or of one grey band; None: as the file says.
 
         Returns:
             The record, with its decision: a `Scanpath`, a `ZoomPath` or a `HeadPath`.
@@ -417,8 +416,8 @@ class ActivePerception(MovableModule):
     ) -> Record:
         """Find all objects of a class, of several or of all classes (`record.objects`, `record.expected`).
 
-        The first look is the whole picture. Each other look is a window at the magnification with the largest expected
-        number of new objects. A photograph is looked at wholly, in few more looks than the first.
+        The first look is the whole picture. Each further look is the window, of any magnification, with the largest
+        expected number of new objects. In a photograph, a few looks after the first cover everything.
 
         Args:
             picture: as for `search`.
@@ -473,7 +472,7 @@ class ActivePerception(MovableModule):
     ) -> Record:
         """Explore a picture: learn which classes are where, without a target.
 
-        It ends at the first limit that is reached, or when no look is expected to gain at least `min_gain`.
+        The exploration ends when a limit is reached, or when no look is expected to gain at least `min_gain`.
 
         Args:
             picture: as for `search`.
@@ -517,13 +516,13 @@ class ActivePerception(MovableModule):
         white: White | None = None,
         bands: ChosenBands = None,
     ) -> GazePrediction:
-        """Predict where people look in a picture that they view freely, from the features that the detector computes.
+        """Predict where people look in a picture, if they view it freely, from features that the detector computes.
 
         Args:
             picture: a photograph, as for `search`, or a `semfov.Panorama`.
             model: a model fitted to the detector (`semfov fit`), its file or folder; None for the one that is shipped.
-            seen: fixations, a record, or points, a pass for each; the prediction then knows only what the agent's fovea
-                has shown at them (`semfov.saliency.features_so_far`). None for the sharp picture.
+            seen: fixations (also a record, or points): the prediction then uses only what the agent's fovea shows at
+                them, by a pass for each (`semfov.saliency.features_so_far`). None for the sharp picture.
             quality: `quick`, one pass of the detector; or `best`, six.
             color: order of the channels of arrays and tensors, `rgb` or `bgr`.
             white: the values that are black and white, as for `search`.
@@ -533,7 +532,7 @@ class ActivePerception(MovableModule):
             The density of fixations, from which scanpaths are drawn.
 
         Raises:
-            InputError: no model is shipped for the detector, the given one is another's, or the fovea bends it.
+            InputError: no model is shipped for the detector, `model` is of another one, or the fovea distorts places.
             DataError: the file of the picture or of the model cannot be read.
         """
         opened = OpenedPicture.of(picture, color, white, bands)
@@ -560,9 +559,9 @@ class ActivePerception(MovableModule):
         color: Color = "rgb",
         white: White | None = None,
     ) -> LivePerception:
-        """Look at a camera or a video: a pass of the detector for every frame, and evidence that fades between them.
+        """Look at a camera or a video, with one pass of the detector at every frame; evidence fades between frames.
 
-        When a place seems to hold the target, the recommended agent spends a frame on a closer look (`search`).
+        When a place seems to hold the target, the recommended agent uses one frame for a closer look, as in `search`.
 
         Args:
             target: class to search for, by name or index; a list finds all objects of its classes, and None explores.

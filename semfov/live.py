@@ -19,20 +19,20 @@ __all__ = ["LivePerception"]
 
 
 class LivePerception(OtherWords):
-    """Looks at the frames of a stream with a pass of the detector each, by a fovea or at windows.
+    """Looks at the frames of a stream, with one pass of the detector at each, through windows or a fovea.
 
-    With `how="auto"` windows are looked at. A fovea looks at frames that are less than four times as long as the
-    detector's input where the agent has no evidence for photographs, or where a first cell is given.
+    With `how="auto"` it looks through windows. It uses a fovea if frames are less than four times as long as the
+    detector's input and either the agent has no evidence for photographs or a first cell is given.
 
-    Looks at windows follow a camera that moves: what they showed is carried along. Where a frame fits none before it,
-    after a cut or in the dark, what was known is set aside, and only what is seen from that frame on is listed. The
-    moment is `lost` until the scene is found again or given up, after twelve frames. The scene is taken to be flat or
-    far away. A fovea does not follow the camera.
+    With windows, objects keep their places when the camera moves. If a frame fits none before it, as after a cut or in
+    the dark, earlier objects are set aside, and only those seen from that frame on are listed. The moment is `lost`
+    until the scene is found again or, after twelve frames, given up. The scene is assumed to be flat or far away. A
+    fovea does not follow the camera.
 
     Args:
-        parts: the agent, whose parts look by a fovea and at windows.
+        parts: the agent, which has a part for each kind of look.
         target: class 1..K to search for; None explores.
-        targets: classes 1..K whose objects are all to be found, which windows do; empty for `target`.
+        targets: classes 1..K of which to find all objects, with windows; empty to use `target`.
         settings: the settings of the task; None for the defaults.
         white: the values that are black and white in frames of other types than bytes (`ActivePerception.search`).
 
@@ -101,17 +101,17 @@ class LivePerception(OtherWords):
 
         Args:
             frame: a picture of any common kind (`semfov.as_image`), of the same size as the first frame.
-            passed: seconds since the last frame, by which evidence fades, such as the difference of two time stamps;
-                what is not given is taken to be 1/25 s.
-            pose: where the camera is, if that is known from a gimbal or from odometry: the map from pixels of the first
-                frame to pixels of this one, a `semfov.motion.Motion` or its `(3, 3)` or `(2, 3)` matrix; for all frames
-                or none. None estimates the motion from the frames (`semfov.motion.CameraMotion`).
+            passed: seconds since the last frame, for which evidence fades, such as the difference of two time stamps;
+                1/25 s if it is not given.
+            pose: the map from pixels of the first frame to pixels of this one, if the camera's motion is known from a
+                gimbal or odometry: a `semfov.motion.Motion`, or its `(3, 3)` or `(2, 3)` matrix. Give it for all frames
+                or none. None: the motion is estimated from the frames (`semfov.motion.CameraMotion`).
 
         Returns:
             What is known at this frame: a `FoveaMoment` or a `WindowMoment`.
 
         Raises:
-            InputError: it is no picture, or has another size, or an argument does not fit the kind of look.
+            InputError: the frame is no picture or has another size, or an argument does not fit the kind of look.
             DataError: the file of the frame cannot be read.
         """
         got = "None (OpenCV gives None after the last frame, and where it cannot read one)"
@@ -128,11 +128,11 @@ class LivePerception(OtherWords):
 
     @property
     def criterion(self) -> str | None:
-        """What a search needs for the decision `found`, in words, after the first frame; None for no decision."""
+        """What the decision `found` requires, in words; None before the first frame, and without decisions."""
         return None if self.how == "auto" else self._episodes[self.how].criterion
 
     def describe(self) -> str:
-        """Say what is done in a few words."""
+        """Describe the task in a few words."""
         return next(iter(self._episodes.values())).describe()
 
     def __repr__(self) -> str:

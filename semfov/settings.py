@@ -71,7 +71,7 @@ def _only_for(*kinds: KindName, instead: str) -> Mapping[str, object]:
 
 @dataclass(frozen=True)
 class LookSettings(CheckedSettings):
-    """Settings of all episodes with a picture: the kind of look, and the limits. It ends at the first that is reached.
+    """Settings of all episodes with a picture: the kind of look, and limits. The first limit that is reached ends it.
 
     Args:
         how: kind of look: `fovea`, `windows`, `head` (in a panorama, which is twice as wide as high, or another picture
@@ -79,7 +79,7 @@ class LookSettings(CheckedSettings):
         passes: largest number of passes of the detector, closer looks included (None: 24 for windows, 40 for a head).
         shifts: largest number of gaze shifts of a fovea (None: 30 for a search, 20 otherwise; with `passes` no limit).
         seconds: longest time in seconds for a picture on this machine.
-        duration: in a scene, longest time in seconds that the movements of eye and head take (None: 30).
+        duration: in a scene, longest time in seconds for the movements of eye and head (None: 30).
         on_look: function that is called after each look with the record so far; returning False ends the episode.
 
     Raises:
@@ -102,7 +102,7 @@ class LookSettings(CheckedSettings):
         check(self.on_look is None or callable(self.on_look), "on_look", "a function of the record", self.on_look)
 
     def check_suitable(self, kind: LookKind) -> None:
-        """Raise `InputError` for a setting that means nothing to a kind of look, with what to use instead.
+        """Raise `InputError` for a setting that a kind of look does not have; the message says what to use instead.
 
         Args:
             kind: the kind of look.
@@ -149,11 +149,11 @@ class DecisionSettings(CheckedSettings):
             that the picture holds it (None: the threshold that was chosen when the model was fitted, or a score of 0.5
             for agents without a fitted belief).
         stop_below: chance of a new hit below which the search stops (None: the threshold of the model).
-        closer: largest number of closer looks, in which a window around a place that seems to hold the target is
-            enlarged to the detector's input, each a pass (None: 3 in a photograph, all that there are passes for in a
-            large picture, 2 for a fovea); 0 makes none.
-        prior: how often the target is there: the share of the pictures that hold it, such as 0.15 (None: one half);
-            `fit` takes that of the searches that the models were fitted to.
+        closer: largest number of closer looks, each of which enlarges a window around a place that seems to hold the
+            target to the detector's input, in one pass (None: 3 in a photograph, as many as there are passes in a large
+            picture, 2 for a fovea); 0: none.
+        prior: share of the pictures that hold the target, such as 0.15 (None: one half); `fit` takes the share in the
+            searches that the models were fitted to.
 
     Raises:
         InputError: a value is out of range.
@@ -255,16 +255,16 @@ class StreamSettings(DecisionSettings, StartSettings):
             no evidence for photographs or `start` is given.
         rate: rate at which evidence fades, per second; 0: never (None: 2.5 for a fovea, 0.75 for windows).
         passes: passes of the detector at each frame, for windows (None: 1).
-        confirm: the target is found from this probability on, with closer looks that of its place (None: that of the
-            model).
+        confirm: least probability of the target for `found`: with closer looks, that it is at the place (None: the
+            threshold of the model).
         stop_below: chance of a new hit below which no closer look is made (None: that of the belief alone, as a belief
             that fades can reach it, or with rate 0 that of a search).
         closer: largest number of closer looks in the time until half of the evidence has faded (None: 2 for a fovea, 3
-            for windows of small frames, as many as there are frames for those of large ones); 0: none.
+            for windows in small frames, no limit for windows in large ones); 0: none.
         prior: how often the target is there: the share of the frames that hold it (None: one half); `fit` takes that of
             the searches that the models were fitted to.
-        score_threshold: probability from which on an object is listed in windows (None: 0.5); a
-            curve of precision over recall takes a lower one.
+        score_threshold: probability from which on an object is listed in windows (None: 0.5); for a curve of precision
+            over recall give a lower one.
         color: order of the channels of frames that are arrays or tensors, `rgb`, or `bgr` as OpenCV reads them.
 
     Raises:

@@ -23,14 +23,13 @@ class Policy(nn.Module):
 
     Args:
         function: name of an acquisition function (`policy_names`), or its class.
-        model: model that the function is made from; one that needs none leaves it out.
-        samples: number of looks that are drawn for each class and level, over which a function that predicts looks
-            takes the expectation; the model's Dirichlets must be densities of the scores. None takes the look with the
-            expected scores, as published. They are drawn anew when the model has changed, except in a compiled graph
-            and in `torch.func`.
+        model: observation model for the function; ignored if it needs none.
+        samples: number of simulated looks for each class and level, over which a function that predicts looks averages;
+            the model's Dirichlets must be densities of the scores. None: one look with the expected scores, as in the
+            paper. The looks are drawn again when the model has changed, except in a compiled graph and in `torch.func`.
         calibrated: whether the scores of a drawn look are calibrated before they update the belief.
-        settings: further arguments of the acquisition function, None included; parameters and modules among them are
-            those of the policy. Their names are others than those of arguments and attributes of `Policy`.
+        settings: further arguments of the acquisition function. Parameters and modules among them become part of the
+            policy. Their names must differ from arguments and attributes of `Policy`.
 
     Raises:
         InputError: there is no such function or setting, or one of a name that is not free, the model is missing, or

@@ -1,4 +1,4 @@
-"""What people looked at: their fixations in pictures, and whether recordings of them are read as they were made."""
+"""Fixations of people in pictures, checks of their recordings, and measures that compare scanpaths."""
 
 from semfov.human.content import CONTENT_PICTURES, FEWEST_PICTURES, content_suspicions
 

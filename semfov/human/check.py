@@ -69,10 +69,10 @@ class _PictureSizes(Mapping[str, tuple[int, int]]):
 
 
 def check_fixations(options: CheckOptions) -> int:
-    """Print what is in files of fixations, and what is suspicious.
+    """Print what files of fixations contain, and what is suspicious in them.
 
     Args:
-        options: the files, and what they do not tell themselves.
+        options: the files, and what they do not say themselves.
 
     Returns:
         The exit code, 1 if anything is suspicious or a file cannot be read.

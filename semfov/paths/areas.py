@@ -36,7 +36,7 @@ def read_areas(areas: AreasLike, size: tuple[int, int], names: Sequence[str] = (
     Args:
         areas: boxes by name, as left, top, right and bottom edge in pixels; the same by picture; a text; or a file.
         size: `(width, height)` of the picture in pixels.
-        names: what the picture may be called where the boxes are by picture.
+        names: names of the picture, if the boxes are given by picture.
 
     Returns:
         The boxes by name, in their order.

@@ -38,30 +38,31 @@ _NAMED = 5  # largest number of objects that the text form names
 class Record(Conversion):
     """Base of all records: its looks, what was looked for, what was found, what was decided, and why it ended.
 
-    A record is the list of its looks (`looks`, or by iteration) and what its kind adds. Its objects are one set: those
-    that `describe` counts, `plot` draws and `objects` returns. All points and boxes are in pixels of the picture.
+    A record lists its looks (`looks`, or by iteration); each kind of record adds attributes. The objects that
+    `describe` counts, `plot` draws and `objects` returns are the same. All points and boxes are in pixels of the
+    picture.
 
-    `describe`, `why_it_ended` and `words` tell it in words. `plot`, `to_frame`, `as_fixations` and `save` make a
-    picture, tables, fixations in the format of human data, and a file.
+    `describe`, `why_it_ended` and `words` describe the record in words. `plot`, `to_frame`, `as_fixations` and `save`
+    make a figure, tables, fixations in the format of human data, and a file.
 
     Attributes:
         classes: names of the classes, background first.
         target: class index 1..K that was searched for; None for all classes.
-        looks: the looks in their order, as the episode made them.
+        looks: the looks in their order.
         found: whether a search found its target.
         closer: closer looks of a search, in order.
         ending: reason for the end; None if it is not known, and for a frame of a stream.
         decision: decision of a search; None for exploration, and for a search without one.
-        prior: share of the pictures that hold the target, as it was given to the search; None for none.
-        assumed: that share as the probability of the decision has it, which is one half without a `prior`
-            (`probability_at` gives others). None where it is not known.
+        prior: share of the pictures that hold the target, if it was given to the search; else None.
+        assumed: the share that the probability of the decision assumes, one half without a `prior` (see
+            `probability_at`). None if it is not known.
         targets: class indices 1..K of a search for several classes; otherwise empty.
-        score_threshold: score from which on objects count, in windows their probability (`words.threshold`).
-        unseen: number of objects that further looks are expected to show, and its variance; None where the scores are
-            no probabilities.
+        score_threshold: least score of a listed object, with windows its least probability (`words.threshold`).
+        unseen: number of objects that further looks are expected to show, and its variance; None if scores are not
+            probabilities.
         photograph: `(3, h, w)`, bytes, the reduced picture; None if it was not kept.
         source: file of the picture; None if it does not come from a file.
-        shown: the `white` and the `bands` that were shown of the file; None for neither.
+        shown: the settings `white` and `bands` with which the file was read; None for neither.
         detector: name of the detector; None if it is not known.
 
     Example::
@@ -138,7 +139,7 @@ class Record(Conversion):
         return ()
 
     def figures(self, boxes: Tensor | None = None) -> dict[str, Callable[[], Figure]]:
-        """List the figures of the record, each of which is drawn when it is called.
+        """List the figures of the record as functions, each of which draws one.
 
         Args:
             boxes: `(M, 4)`, true boxes of the target, drawn dashed.
@@ -149,7 +150,7 @@ class Record(Conversion):
         return {"scanpath": partial(self.plot, boxes=boxes)}
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
-        """Go through what the looks showed, as sharp as the detector saw it.
+        """Iterate over the views of the looks, as sharp as the detector saw them.
 
         Args:
             source: the opened picture, in any size.
@@ -193,7 +194,7 @@ class Record(Conversion):
             people: fixations, those of one person, or the path of a file (`semfov.data.fixations.read_fixations`).
 
         Returns:
-            Each measure of this record and of the people among themselves; it prints as a table.
+            Each measure between this record and the people, and between the people; it prints as a table.
         """
         from semfov.human.scanpath.beside import compare_scanpath
 
@@ -240,9 +241,9 @@ class Record(Conversion):
 
         Args:
             path: the file.
-            title: heading of the page; None takes what was looked for.
-            options: `picture`, the picture in full size, in which narrow windows are sharp; None takes the one that the
-                record keeps. `name`, the name of the picture on the page. `boxes`, `(M, 4)`, true boxes of the target.
+            title: heading of the page; None: the target.
+            options: `picture`, the picture in full size, from which small windows are sharp; None: the one in the
+                record. `name`, the name of the picture on the page. `boxes`, `(M, 4)`, true boxes of the target.
                 `width`, that of the page's pictures in pixels, and `quality`, that of their JPEGs.
 
         Returns:
@@ -340,8 +341,7 @@ class Moment(Record):
 
     Attributes:
         number: number of the frame, from 0.
-        decision: decision at this frame: `found`, `absent`, or `undecided` as long as it is neither; None where nothing
-            is decided.
+        decision: decision at this frame: `found`, `absent` or `undecided`; None if there is no target.
 
     Example::
 
@@ -370,7 +370,7 @@ class Moment(Record):
 
     @property
     def ways(self) -> dict[int, list[tuple[float, float]]]:
-        """The ways of the objects in the last frames, by their numbers: points `(x, y)` in pixels of this frame."""
+        """The paths of the objects in the last frames, by their numbers: points `(x, y)` in pixels of this frame."""
         return {}
 
     @property
@@ -379,7 +379,7 @@ class Moment(Record):
         return None
 
     def draw(self, frame: ImageLike, *, color: Color = "bgr", longest: int | None = None) -> NDArray[np.uint8]:
-        """Draw the look, the belief or the objects, and where the next look goes, into the frame, for a window.
+        """Draw the look, the belief or the objects, and the place of the next look into the frame.
 
         Matplotlib is not needed.
 

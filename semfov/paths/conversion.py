@@ -46,7 +46,7 @@ DECISION_COLUMNS = ("target", "outcome", "probability", "score", "assumed", "pla
 
 
 class Conversion(Outcome, OtherWords):
-    """Conversion of a record to words, of its looks and objects to tables, and of objects to other formats."""
+    """Converts a record to words, its looks and objects to tables, and the objects to other formats."""
 
     _other_words = RECORD
     _objects = "record.objects"
@@ -79,7 +79,7 @@ class Conversion(Outcome, OtherWords):
         return self.words.why_it_ended()
 
     def summary(self) -> str:
-        """Describe the outcome, explain why the search or the exploration ended, and name the best place of doubt.
+        """Describe the outcome, explain why the search or exploration ended, and name the best place if in doubt.
 
         Returns:
             The sentences.
@@ -87,14 +87,14 @@ class Conversion(Outcome, OtherWords):
         return self.words.summary()
 
     def rows(self) -> list[Values]:
-        """Make a table of the looks, of plain values, whose first columns all kinds of records have.
+        """Make a table of the looks, of plain values. All kinds of records have the first columns.
 
         `look` is the number of the look, from 1, `x` and `y` are the fixated point, and `x1`, `y1`, `x2` and `y2` the
         part of the picture that it shows, in picture pixels. `detections` counts those from score 0.1 on, `seen` is the
         class of the most confident one, and `score` its confidence. `seconds` is the time at the end of the look, on
-        the clock of the episode. `value` is that for which the look was chosen. `closer` is the probability that the
-        target is there, by a closer look that this is, or that follows it. `brought` is the number of objects that it
-        shows most sharply. The columns that the kind adds come last.
+        the clock of the episode. `value` is the value for which the look was chosen. `closer` is the probability that
+        the target is at the place, if this is a closer look, or a closer look follows. `brought` is the number of
+        objects that no other look shows more sharply. The columns of the kind of look come last.
 
         Returns:
             One dictionary for each look.
@@ -134,10 +134,10 @@ class Conversion(Outcome, OtherWords):
         """Convert the outcome, the objects (`object_rows`) and the looks (`rows`) to JSON values.
 
         Returns:
-            Values by name. Point and box of a search are those of the found target, or of the best place of one that
-            leaves it open, as `outcome` tells; `place_probability` is that the target is there, and `probability` that
-            it is anywhere in the picture. Where none was learned, both are None, and `score` has the number by which
-            it was decided. None without a place, and for numbers and errors that are not claimed.
+            Values by name. If the target was found, point and box are those of the target, otherwise those of its best
+            place; `place_probability` is the probability that the target is there, and `probability` that it is
+            anywhere in the picture. Without fitted models both are None, and `score` is the number on which the
+            decision rests. Unknown values are None.
         """
         width, height = self.size
         return {
@@ -347,8 +347,8 @@ class Conversion(Outcome, OtherWords):
         """Convert the objects to labels in the format of YOLO: a line of class, x, y, width and height for each.
 
         Classes are numbered from 0, without background. `x` and `y` are the middle of the box, and all four are shares
-        of the width and height of the picture. Boxes end at its borders. The format has no scores: what the decision or
-        a closer look confirmed is among the labels with any score (`confirmed`).
+        of the width and height of the picture. Boxes are cut at its borders. The format has no scores; an object that
+        the decision or a closer look confirmed is included, whatever its score (`confirmed`).
 
         Args:
             path: the file to write; None writes none.
@@ -369,18 +369,17 @@ class Conversion(Outcome, OtherWords):
         return _written("".join(lines), path)
 
     def crops(self, picture: LargePicture | ImageLike | None = None, *, boxes: Tensor | None = None) -> list[Tensor]:
-        """Cut what the box of each object shows out of the picture.
+        """Cut the box of each object out of the picture.
 
         Args:
-            picture: the picture in full size; None takes the file that the record comes from, with the values and
-                bands that were shown.
+            picture: the picture in full size; None: the file of the record, read with the same settings (`shown`).
             boxes: `(M, 4)`, other boxes to cut out, such as that of the best place; None takes those of the objects.
 
         Returns:
             `(3, h, w)` bytes of each of the boxes, in their order, at least a pixel wide and high.
 
         Raises:
-            InputError: no picture is given, or the record's is not known, or it has another size.
+            InputError: no picture is given and the record has no file, or the picture has another size.
             DataError: the file cannot be read.
         """
         opened = self._opened(picture)
@@ -415,8 +414,8 @@ class Conversion(Outcome, OtherWords):
         """Convert the objects to GeoJSON (RFC 7946): a polygon for each box, with class, score and look.
 
         For a picture from a GeoTIFF coordinates are longitude and latitude (WGS 84), and a box over the antimeridian
-        has two polygons, one on each side. Other pictures have no place on earth: their coordinates are pixels with y
-        down, as the member `coordinates` of the collection says.
+        has two polygons, one on each side. For other pictures coordinates are pixels with y down, as the member
+        `coordinates` of the collection says.
 
         Args:
             path: the file to write; None writes none.

@@ -1,4 +1,4 @@
-"""Two drafts of a picture beside each other: where people look in one, in the other, and what differs."""
+"""Comparison of where people look in two drafts of a picture."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ class Drafts:
         """Compute the shares of the fixations in areas of both drafts.
 
         Args:
-            areas: areas in pixels of each draft, as for `GazePrediction.share`. What moves between the drafts has its
-                box in each of them, by the names of the drafts (`names`).
+            areas: areas in pixels of each draft, as for `GazePrediction.share`. If an area moves between the drafts,
+                give its box in each of them, by the names of the drafts (`names`).
 
         Returns:
             The shares by the name of the area.

@@ -49,18 +49,18 @@ _ROUND = 1.5  # least width over height of a panorama
 
 @dataclass(frozen=True, repr=False, eq=False)
 class GazePrediction(OtherWords):
-    """Where people look in a picture that they view freely, without a task.
+    """Prediction of where people look in a picture, if they view it freely, without a task.
 
     Attributes:
-        model: the model; predictions share the one that is shipped, so copy it to change it.
+        model: the model. All predictions share the shipped one: copy it before you change it.
         terms: its terms for this picture (`FixationDensity.terms`).
         size: `(width, height)` of the picture in pixels.
         photograph: `(3, h, w)`, bytes, the reduced picture.
         source: file of the picture; None if it does not come from a file.
-        seen: number of fixations at which the fovea has seen the picture; None for the sharp picture.
+        seen: number of fixations from which the fovea has seen the picture; None for the sharp picture.
         is_shipped: whether the model is the one that is shipped for the detector.
-        unlikeness: distance of the picture from those of the fit, 1 where it begins to be unlike them
-            (`semfov.gaze.saliency.PictureLikeness`); None where it is not known.
+        unlikeness: distance of the picture from those of the fit; from 1 on it counts as unlike them
+            (`semfov.gaze.saliency.PictureLikeness`). None if it is not known.
         panorama: whether the left and the right edge of the picture meet.
 
     Example::
@@ -104,11 +104,12 @@ class GazePrediction(OtherWords):
             model: a model that was fitted to the detector, or its file or folder; None for the one that is shipped.
             source: file of the picture.
             size: `(width, height)` of the picture, of which `image` may be a reduced copy; None for that of `image`.
-            seen: fixations at which the eye has looked, or a record, in any size of the picture, or points in its
-                pixels; the prediction then knows only what the fovea has shown. None for the sharp picture.
+            seen: fixations or a record, in any size of the picture, or points in its pixels: the prediction then uses
+                only what the fovea shows at them. None for the sharp picture.
             quality: `quick`, one pass; or `best`, six passes, over windows and a mirror image, too.
-            panorama: whether it is a panorama of 360°, whose left and right edge meet. It is looked at in four windows
-                around it, a strip in more (`best`: twice as many), and no direction is the middle.
+            panorama: whether it is a panorama of 360°, whose left and right edge meet. The detector gets it in four
+                windows all around, or more if it is a narrow strip (`best`: twice as many), and there is no centre
+                bias.
 
         Returns:
             The prediction.
@@ -161,7 +162,7 @@ class GazePrediction(OtherWords):
 
     @property
     def caution(self) -> str | None:
-        """Why the prediction may be wrong for this picture; None where nothing is known against it."""
+        """Why the prediction may be wrong for this picture; None if there is no reason."""
         blank = _is_blank(self.photograph)
         return Cautions(self.size, self.unlike, blank, self.panorama, self.is_shipped).words()
 
@@ -183,7 +184,7 @@ class GazePrediction(OtherWords):
 
     @property
     def parts(self) -> dict[str, float]:
-        """What each term adds: divergence in bits of the density from the one without the term, by its name."""
+        """How much each term changes the density: its divergence, in bits, from the density without the term."""
         log_density = self.cells.log()  # (rows, columns)
         parts = {}
         for name in self.terms:
@@ -202,9 +203,8 @@ class GazePrediction(OtherWords):
 
         Returns:
             For each place `x` and `y` in pixels of the picture, and `share`, the probability of a fixation within 5 %
-            of the longer side around it, by which they are ordered. Places are at least twice as far apart. Near
-            fixations count more in their choice, so that a place is where the density is high. Fewer places are the
-            first of more.
+            of the longer side around it. Places are ordered by their share, and at least twice this distance apart. A
+            smaller `count` gives the first places of a larger one.
 
         Raises:
             InputError: `count` is out of range.
@@ -220,15 +220,15 @@ class GazePrediction(OtherWords):
     def first_fixations(self, count: int = 3) -> list[dict[str, float]]:
         """List where people look first, in order.
 
-        A viewer's eyes are in the middle when the picture appears. For each fixation after that one, this is the place
-        that most of 100 drawn viewers reach with it, of those that no earlier fixation of the list has reached.
+        A viewer's eyes are in the middle when the picture appears. For each later fixation, the list has the place that
+        most of 100 simulated viewers fixate, unless it is in the list already.
 
         Args:
             count: number of fixations, from 1 to 10.
 
         Returns:
             For each fixation `x` and `y` in pixels of the picture, and `share`, the share of the viewers whose fixation
-            of this number is within 5 % of the longer side of it. Fewer fixations are the first of more.
+            of this number is within 5 % of the longer side around it.
 
         Raises:
             InputError: `count` is out of range.
@@ -259,8 +259,8 @@ class GazePrediction(OtherWords):
 
         Args:
             areas: boxes by name, as left, top, right and bottom edge in pixels of the picture; a text such as
-                `logo:10,20,200,80 price:300,40,420,90`; or a JSON file, `{"logo": [10, 20, 200, 80]}`. Where they lie
-                elsewhere in each of several pictures, boxes by name for each picture by its name.
+                `logo:10,20,200,80 price:300,40,420,90`; or a JSON file, `{"logo": [10, 20, 200, 80]}`. If the areas lie
+                elsewhere in each picture, a mapping from the picture's name to its boxes by name.
 
         Returns:
             The shares by name, from 0 to 1. Areas that overlap share fixations.
@@ -276,7 +276,7 @@ class GazePrediction(OtherWords):
         return {name: share_in(self.density, area) for name, area in self.areas(areas).items()}
 
     def visits(self, areas: AreasLike, *, seconds: float = 3.0) -> dict[str, AreaVisits]:
-        """Compute how many of 100 drawn viewers see each area of interest at least once, and after which time.
+        """Compute how many of 100 simulated viewers see each area of interest at least once, and after which time.
 
         Args:
             areas: as for `share`.
@@ -321,8 +321,8 @@ class GazePrediction(OtherWords):
     def scanpaths(self, people: int = 15, *, seconds: float = 3.0, seed: int = 0) -> list[Fixations]:
         """Draw scanpaths of viewers.
 
-        Durations and pauses are drawn from the distributions of the people of the fit, and first fixations from the
-        product of theirs and the density of the picture.
+        Durations and pauses are drawn from the distributions of the people of the fit; first fixations from the
+        distribution of their first fixations, times the density of this picture.
 
         Args:
             people: number of viewers.
@@ -361,7 +361,7 @@ class GazePrediction(OtherWords):
         return self.photograph.float() / 255
 
     def given(self, scanpaths: Sequence[Fixations], number: int) -> Tensor:
-        """Predict the mean density over the cells of the next fixation of viewers after `number` fixations.
+        """Predict the density of viewers' next fixation after `number` fixations, as a mean over viewers.
 
         Args:
             scanpaths: their scanpaths; those that are shorter are left out.
@@ -383,8 +383,8 @@ class GazePrediction(OtherWords):
     def next_density(self, scanpath: ScanpathLike) -> Tensor:
         """Predict the probability of a viewer's next fixation in each pixel, after the fixations so far.
 
-        What is known of the picture is the same as for `density`: all of it, or with `agent.gaze(picture,
-        seen=scanpath)` what a fovea has shown at these fixations.
+        As for `density`, the prediction uses the whole sharp picture, or with `agent.gaze(picture, seen=scanpath)` what
+        a fovea shows at these fixations.
 
         Args:
             scanpath: the fixations so far, or a record, in any size of the picture, or points in its pixels.
@@ -421,7 +421,7 @@ class GazePrediction(OtherWords):
         return compare_density(self, people)
 
     def plot(self, ax: Axes | None = None, **options: Any) -> Figure:
-        """Draw the smallest areas with 10 to 90 % of the fixations over the picture, and the first three fixations.
+        """Draw the smallest areas that contain 10 to 90 % of the fixations, and the first three fixations.
 
         Args:
             ax: axes to draw in; None makes a new figure.
@@ -436,7 +436,7 @@ class GazePrediction(OtherWords):
         return plot_gaze(self, ax=ax, **options)
 
     def animate(self, path: str | PathLike[str] | None = None, **options: Any) -> Path | Any:
-        """Make a film of drawn viewers: a frame after each fixation, with the mean density of their next ones.
+        """Make a film of simulated viewers: a frame after each fixation, with the mean density of the next one.
 
         Args:
             path: GIF file to write, with an MP4 beside it where ffmpeg is installed; None returns the film for a

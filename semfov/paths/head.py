@@ -94,7 +94,7 @@ class HeadWords(Words):
         return f"{outcome} in {seconds:.1f} s of eye and head: {looks}, {turns}"
 
     def why_it_ended(self) -> str:
-        """Explain in one sentence why it ended, with the time limit of the scene where that ended it."""
+        """Explain in one sentence why the episode ended; if by the scene's time limit, with this limit."""
         sentence = super().why_it_ended()
         if self.record.ending != "duration" or self.record.duration is None:
             return sentence
@@ -186,7 +186,7 @@ def head_looks(
 class HeadPath(Record):
     """The record of an episode: where eye and head looked, what was seen and what was believed.
 
-    Beside the attributes of `semfov.paths.Record` it has those of its looks.
+    In addition to the attributes of `semfov.paths.Record` it has those of its looks.
 
     Attributes:
         views: the views and fixations that were possible. Those of a path from a file have the geometry of the scene,
@@ -241,9 +241,9 @@ class HeadPath(Record):
     def candidates(self) -> Objects:
         """Objects merged from the detections of all looks, of all scores from 0.05 on, with boxes in picture pixels.
 
-        A box is the smallest one around the region of the scene. One that crosses the seam of a panorama begins inside
-        the picture and ends beyond its right border. Of several boxes of one object, one that no border of the view
-        cuts is kept, and of these the box of the nearest fixation.
+        A box is the smallest one around the object's region of the scene. If it crosses the seam of a panorama, it
+        begins inside the picture and ends beyond the right border. Of several boxes of one object, the one from the
+        nearest fixation is kept, if possible one that no border of the view cuts.
         """
         fixations = []
         for look in self.looks:
@@ -350,7 +350,7 @@ class HeadPath(Record):
         return regions, labels[chosen], confidence[chosen]
 
     def outline(self, look: RecordedLook) -> Tensor:
-        """Border of the view of a look, `(P, 2)`; it goes on beyond the picture where it crosses its seam."""
+        """Border of the view of a look, `(P, 2)`; it continues beyond the picture if it crosses a panorama's seam."""
         world = self.views.world
         view = torch.tensor([[0.0, 0.0, *map(float, world.size)]])
         places = world.places(view, self.pose(look.index))

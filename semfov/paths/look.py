@@ -32,7 +32,7 @@ class RecordedLook(OtherWords):
         detections: its detections, a batch of one.
         seconds: time at its end, on the clock of the episode; None if it is not known.
         value: value for which it was chosen; None if it was not chosen by a value.
-        more: what looks of this kind have beside, as plain values: further columns of `Record.rows`.
+        more: further columns of `Record.rows`, which looks of this kind have, as plain values.
 
     Example::
 
@@ -52,7 +52,7 @@ class RecordedLook(OtherWords):
 
     @property
     def number(self) -> int:
-        """Number of the look as pages, figures, tables and files have it: the first look has the number 1."""
+        """Number of the look in pages, figures, tables and files, from 1."""
         return self.index + 1
 
     def __repr__(self) -> str:
@@ -64,7 +64,7 @@ class RecordedLook(OtherWords):
 
 
 def finite_or_none(value: float | None) -> float | None:
-    """Take the value of a look for its record; None for the infinite one of a look that was not chosen by a value."""
+    """Return the value of a look for its record: None if it is infinite, as no value led to the look."""
     return value if value is not None and math.isfinite(value) else None
 
 

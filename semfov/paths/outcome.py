@@ -29,7 +29,7 @@ _CONFIRMING = 0.5  # probability from which on a closer look confirms that the t
 
 
 def sought_classes(target: int | None, targets: tuple[int, ...]) -> tuple[int, ...]:
-    """List the classes that are looked for: several, or the target alone; none stands for all.
+    """List the classes that are searched for: several, or the target; an empty list stands for all.
 
     >>> sought_classes(3, ()), sought_classes(None, (3, 5)), sought_classes(None, ())
     ((3,), (3, 5), ())
@@ -40,7 +40,7 @@ def sought_classes(target: int | None, targets: tuple[int, ...]) -> tuple[int, .
 
 
 class NumberByClass(dict[str, float]):
-    """Numbers by the name of their class, which may be in the plural or another spelling, as that of a target may."""
+    """Numbers by the name of their class; as for targets, plurals and other spellings are understood."""
 
     def __missing__(self, name: str) -> float:
         """Return the number of the class that a name means."""
@@ -52,7 +52,7 @@ class NumberByClass(dict[str, float]):
         return self.get(name) is not None
 
     def get(self, name: object, default: Any = None) -> Any:
-        """Return the number of the class that a name means, or the default where there is none."""
+        """Return the number for the class that a name means, or the default if there is none."""
         try:
             return self[str(name)]
         except InputError:
@@ -113,7 +113,7 @@ class Outcome(ABC):
 
     @property
     def fixated(self) -> tuple[RecordedLook, ...]:
-        """The looks that move the gaze: all of windows and of a head, of a fovea those that are no closer looks."""
+        """The looks that move the gaze: with a fovea all but closer looks, otherwise all."""
         return self.looks
 
     @property
@@ -169,9 +169,8 @@ class Outcome(ABC):
         .. math:: \operatorname{logit} P' = \operatorname{logit} P + \operatorname{logit} \pi
                   - \operatorname{logit} \pi_{\mathrm{assumed}}
 
-        (`semfov.belief.prior.with_prior`). It is that of the looks that were made: a search with this `prior` may end
-        after others. For a head, whose probability is that of its most probable cell, the change is an upper bound:
-        that of a search with this `prior` is smaller.
+        (`semfov.belief.prior.with_prior`). This assumes the same looks; a search with this `prior` may take others. For
+        a head, whose probability is that of its most probable cell, the change is an upper bound.
 
         Args:
             prior: share of the pictures that hold the target, above 0 and below 1.
@@ -234,11 +233,11 @@ class Outcome(ABC):
 
     @property
     def objects(self) -> Objects:
-        """The candidates of the targets that have at least the score `score_threshold`, or that were confirmed.
+        """The candidates of the target classes with at least the score `score_threshold`, and confirmed ones.
 
-        One that was confirmed has the box that confirmed it, unless that shows a part of it, and that box's probability
-        where it is higher than a score that is no probability. A search that did not find its target lists none:
-        `best_place` is where the target is most likely.
+        A confirmed object has the box of the look that confirmed it, unless this box shows only a part, and its
+        probability if scores are not probabilities and it is higher. A search that did not find its target lists no
+        objects: `best_place` is where the target is most likely.
         """
         return self._outcome[0]
 
@@ -260,25 +259,24 @@ class Outcome(ABC):
 
     @property
     def expected(self) -> dict[str, float]:
-        """Expected number of objects by the name of their class; NaN, and null in files, where it is not known.
+        """Expected number of objects by the name of their class; NaN (in files null) if it is not known.
 
-        It is the sum of the probabilities of all candidates, and of what further looks are expected to show, of which
-        each class has its share of that sum; for several classes that were asked for, and in a search, what looks have
-        shown is all that counts. It is not known where scores are no probabilities, as in looks of a fovea
-        or a head. Of a class to which the detector hardly reacts (`semfov.paths.ZoomPath.reacts`) it is twice the sum
-        (`semfov.zoom.certainty.number_of_faint`), and not known in a large picture in which no other class is clear.
-        For the target of a search it is at least the probability of the decision, since a picture that holds the target
-        holds one or more.
+        It is the sum of the probabilities of all candidates, plus the class's share of the objects that further looks
+        are expected to show (without this term in a search, or if several classes were asked for). It is not known if
+        scores are not probabilities, as with a fovea or a head. If the detector hardly reacts to the class
+        (`semfov.paths.ZoomPath.reacts`), it is twice the sum (`semfov.zoom.certainty.number_of_faint`), and not known
+        in a large picture in which no other class is clear. For the target of a search it is at least the probability
+        of the decision.
         """
         return NumberByClass({name: mean for name, (mean, _) in self._claimed().items()})
 
     @property
     def expected_error(self) -> dict[str, float]:
-        r"""Standard deviation of the expected number of objects by the name of their class; NaN where it is not known.
+        r"""Standard deviation of the expected number of objects by the name of their class; NaN if it is not known.
 
-        The number of right candidates varies by a factor φ (`semfov.zoom.certainty.DISPERSION`) more than if they were
-        independent, and what no look has shown has the distribution of `semfov.zoom.certainty`. Pictures differ in how
-        far the model suits them, by a share :math:`\tau` (`spread`) of the expected number E:
+        Its variance has three terms: that of independent candidates, times a factor φ
+        (`semfov.zoom.certainty.DISPERSION`); that of the n objects that no look has shown; and, because the model suits
+        some pictures better than others, a share :math:`\tau` (`spread`) of the expected number E, squared:
 
         .. math:: \sigma^2 = \varphi \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2
         """
@@ -286,10 +284,10 @@ class Outcome(ABC):
 
     @property
     def expected_guessed(self) -> dict[str, bool | None]:
-        """Whether the expected number of objects is a guess, by the name of their class; None where it is not known.
+        """Whether the expected number of objects is a guess, by the name of their class; None if it is not known.
 
-        It is where the detector hardly reacts to the class (`semfov.paths.ZoomPath.reacts`). There the words of the
-        record say `at a guess`, if an object of it is listed, or at least one half is expected.
+        It is a guess if the detector hardly reacts to the class (`semfov.paths.ZoomPath.reacts`). The words of the
+        record then say `at a guess`, if an object of the class is listed or at least one half is expected.
         """
         return {name: None if isnan(mean) else False for name, (mean, _) in self._claimed().items()}
 
@@ -305,10 +303,10 @@ class Outcome(ABC):
 
     @property
     def place_probability(self) -> float | None:
-        """Probability that the target of a search is at the place that it names: where it was found, or most likely.
+        """Probability that the target is at the place that the search reports, found or most likely.
 
-        The decision's own probability is that the picture holds the target anywhere. None where no place is named, or
-        where only a score of it is known.
+        None if the search reports no place, or has only a score. (The probability of the decision is that the picture
+        holds the target anywhere.)
         """
         best = self.best_place
         if best is not None:
@@ -318,7 +316,7 @@ class Outcome(ABC):
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether a search leaves it open if the target is there: it is undecided, or only probably absent."""
+        """Whether the search leaves open if the target is present: it is undecided, or only probably absent."""
         decision = self.decision
         if decision is None or decision.outcome == "found":
             return False
@@ -327,9 +325,9 @@ class Outcome(ABC):
 
     @property
     def best_place(self) -> tuple[Tensor, float] | None:
-        """Where the target of a search is most likely that leaves it open, a box `(4,)`, and its probability or score.
+        """The most likely place of a target that was not found: a box `(4,)`, and its probability or score.
 
-        None where the target was found, is surely absent (below a probability of 0.1), or where nothing is like it.
+        None if the target was found or is surely absent (a probability below 0.1), or if nothing looks like it.
         """
         decision = self.decision
         if decision is None or not self.is_doubtful:

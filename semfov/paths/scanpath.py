@@ -147,7 +147,7 @@ class ScanpathWords(Words):
 
     @property
     def decided_by(self) -> str:
-        """What the number of the decision is: a `probability`, or a `belief` without thresholds."""
+        """Kind of the decision's number: `probability`, or `belief` (without thresholds)."""
         record = self.record
         if record.ending == "detection":
             return "belief"
@@ -206,7 +206,7 @@ class Scanpath(_CellRecord):
     A notebook shows a scanpath as an interactive page. `plot`, `animate`, `to_frame` and `save` make a picture, an
     animation, a table and a file.
 
-    Beside the attributes of `semfov.paths.Record` it has those of its fixations, of which there are n.
+    In addition to the attributes of `semfov.paths.Record` it has those of its n fixations.
 
     Attributes:
         grid: the cells of the image.
@@ -285,7 +285,7 @@ class Scanpath(_CellRecord):
         return self.stimulus.views(self.fixations)
 
     def fixation_after(self, index: int) -> int:
-        """Count to the last fixation up to a look, from 0: the index of the tensors of the fixations.
+        """Find the last fixation up to a look: its index in the tensors of the fixations.
 
         Args:
             index: place of the look in the record, from 0; negative ones count from the end.
@@ -309,7 +309,7 @@ class Scanpath(_CellRecord):
         return self.grid, posterior[fixation]
 
     def regions(self, index: int = -1) -> Sequence[Region]:
-        """Find the regions of the map of what is where after a look of an exploration; a search has none."""
+        """Find the regions of the semantic map after a look of an exploration; a search has none."""
         if self.target is not None:
             return ()
         return named_regions(self.grid, self.probabilities[self.fixation_after(index)], self.classes)
@@ -329,7 +329,7 @@ class Scanpath(_CellRecord):
         return figures
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:
-        """Show foveated views, and of closer looks the enlarged windows; without the stimulus parts of the picture."""
+        """Iterate over foveated views and enlarged windows, or without the stimulus over parts of the picture."""
         parts = super().look_views(source)
         if self.stimulus is None:
             yield from parts
@@ -467,9 +467,9 @@ class FoveaMomentWords(MomentWords):
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class FoveaMoment(_CellRecord, Moment):
-    """Look, belief and decision at one frame that a fovea looks at.
+    """Look, belief and decision at one frame of a stream with a fovea.
 
-    Beside the attributes of `Moment` it has those of its look.
+    In addition to the attributes of `Moment` it has those of its look.
 
     Attributes:
         grid: the cells.
@@ -477,9 +477,9 @@ class FoveaMoment(_CellRecord, Moment):
             closer look has the stage `detect` alone.
         probability: `(X·Y,)`, probability that each cell holds the target, or any object in an exploration, after the
             last look that was not a closer one.
-        visited: `(X·Y,)` boolean, cells that inhibition of return keeps the gaze from.
+        visited: `(X·Y,)` boolean, cells that inhibition of return excludes.
         next_cell: the cell to look at in the next frame.
-        belief: belief of one episode that gave the probability; None in a moment from a file.
+        belief: the belief of the episode; None in a moment from a file.
 
     Example::
 

@@ -1,4 +1,4 @@
-"""Viewers that are drawn from a prediction of gaze: where they begin, how long they look, and what they see when."""
+"""Simulated viewers: where they begin, how long they look, and when they see an area."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class AreaVisits(NamedTuple):
 
     Attributes:
         viewers: share of the viewers with at least one fixation in the area.
-        seconds: of these viewers alone, the median of the time at which their first fixation in it begins (time to
-            first fixation); None where nobody sees it. The eyes are in the middle when the picture appears, so an area
-            there is seen at 0.
+        seconds: the median, over these viewers, of the time at which their first fixation in the area begins (time to
+            first fixation); None if nobody sees it. The eyes begin in the middle, so an area in the middle is seen at
+            0.
 
     >>> str(AreaVisits(0.36, 0.84))
     'seen by 36 % of viewers, by these first after 0.8 s'

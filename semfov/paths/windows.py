@@ -106,7 +106,7 @@ class WindowWords(Words):
         return f"{self.objects}. {looks}"
 
     def why_it_ended(self) -> str:
-        """Explain in one sentence why it ended, or what a decision without candidates says."""
+        """Explain in one sentence why the episode ended, or what a decision without candidates means."""
         return self._sentences["unseen"] if self._lacked_candidates() else super().why_it_ended()
 
     def _lacked_candidates(self) -> bool:
@@ -123,9 +123,9 @@ class WindowWords(Words):
     def objects(self) -> str:
         """Number of the objects, by class where classes were searched for, and how many to expect in all.
 
-        Such as `36 people found; expect 45 ± 9 in all`, or `No cup found`; to which a detector hardly reacts, `2 people
-        found; expect at a guess 9.0 ± 9.9 in all`. Without a class to search for no number in all is given, since the
-        small rests of all classes add up to many.
+        For example `36 people found; expect 45 ± 9 in all` or `No cup found`; if the detector hardly reacts to the
+        class, `2 people found; expect at a guess 9.0 ± 9.9 in all`. If no class was named there is no total, since the
+        small expectations of all classes add up to many.
         """
         record = self.record
         # Of one class the name stands before, with the objects that are listed.
@@ -169,7 +169,7 @@ class WindowWords(Words):
 
     @property
     def value(self) -> str:
-        """What the values of looks are (`semfov.zoom.policy`); slices are chosen by scores (`semfov.zoom.slices`)."""
+        """What the values of looks mean (`semfov.zoom.policy`); for slices they are scores (`semfov.zoom.slices`)."""
         # Without learned evidence looks are chosen by scores, and slices of photographs always are.
         scores = "the sum of the scores that the first look has in it"
         if self.record.decision is not None:
@@ -278,9 +278,9 @@ class ZoomPath(Record):
             is at the place.
         candidates: objects merged from all looks (`semfov.zoom.merge`). With a fitted certainty their scores are the
             probabilities that box and class are right.
-        spread: standard deviation of the share of the expected number by which it is off because the model does not
-            suit the picture (`semfov.zoom.certainty`).
-        found: whether the decision is `found`, or without a decision, whether there are objects of the targets.
+        spread: standard deviation of the relative error of the expected number, because models suit pictures more or
+            less (`semfov.zoom.certainty`).
+        found: whether the decision is `found`; without a decision, whether there are objects of the target classes.
         closer: closer looks of a search, in their order; they are among the `looks`, each with its `number`.
 
     >>> nothing = Objects(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0).long(), torch.zeros(0).long())
@@ -316,10 +316,10 @@ class ZoomPath(Record):
 
     @property
     def reacts(self) -> bool:
-        """Whether the detector reacts to one of the classes at least, so that a number of objects can be believed.
+        """Whether the detector reacts clearly to at least one class, so that the expected number is more than a guess.
 
-        It does where objects are listed of which five or more have a probability of one half, or where these make up
-        three fifths of the sum of all probabilities. Otherwise most of that sum is of faint candidates.
+        It does if five or more listed objects have a probability of at least one half, or if such objects make up three
+        fifths of the sum of all probabilities.
         """
         return any(map(self._reacts_to, self.sought or self.candidates.labels.unique().tolist()))
 
@@ -485,18 +485,18 @@ class WindowMomentWords(WindowWords, MomentWords):
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class WindowMoment(ZoomPath, Moment):
-    """The looks that count at one frame whose windows are looked at, and what they show.
+    """The record of one frame of a stream with windows: the looks that count, and what they show.
 
-    It is the record of these looks, the last of which is at this frame. Its objects are merged from them. Those of
-    earlier frames are where the camera shows their places now; looks at what has left the frame are left out.
+    The last of these looks is at this frame. The objects are merged from all of them; those of earlier frames are where
+    the camera shows their places now. Looks at places outside the frame are left out.
 
     Beside the attributes of `ZoomPath` and `Moment` it has what comes next.
 
     Attributes:
-        tracks: the objects that are known, of all frames so far, with those that are hidden or have left the frame.
+        tracks: the tracked objects of all frames so far, also those that are hidden or have left the frame.
         next_window: the window to look at in the next frame, unless the camera loses the scene, or finds it again.
-        lost: whether what was known of a scene is set aside: from a frame that fits none before it, as after a cut or
-            in the dark, until the scene is found again or given up.
+        lost: whether the scene is lost: from a frame that fits none before it, as after a cut or in the dark, until the
+            scene is found again or given up.
 
     Example::
 
@@ -529,7 +529,7 @@ class WindowMoment(ZoomPath, Moment):
 
     @property
     def ways(self) -> dict[int, list[tuple[float, float]]]:
-        """The ways of the objects in the last frames, by their numbers: points `(x, y)` in pixels of this frame."""
+        """The paths of the objects in the last frames, by their numbers: points `(x, y)` in pixels of this frame."""
         numbers = self.objects.track_ids
         return {} if numbers is None else self.tracks.of_ids(numbers).ways()
 
@@ -541,11 +541,11 @@ class WindowMoment(ZoomPath, Moment):
     def to_mot(self) -> str:
         """Convert the objects of the frame to lines in the format of MOTChallenge.
 
-        Each line has the frame, the number of the object, the left and upper edge, width and height of its box, and its
-        probability, and three times -1 for what is not known. Frames and pixels are counted from 1.
+        Each line has the frame, the number of the object, the left and upper edge, width and height of its box, its
+        probability, and three times -1 for unknown values. Frames and pixels are counted from 1.
 
         Returns:
-            The lines; empty without objects. Joined, those of all frames are the file of a film.
+            The lines; empty without objects. The lines of all frames, joined, are the file of a film.
 
         Example::
 

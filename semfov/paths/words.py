@@ -1,4 +1,4 @@
-"""The words for a record: what was found, why it ended, and what its numbers are."""
+"""The words for a record: what was found, why the episode ended, and what its numbers mean."""
 
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -62,7 +62,7 @@ class Words(ABC):
 
     @property
     def lines(self) -> list[str]:
-        """Lines of the text form on the looks."""
+        """Lines about the looks, for the printed record."""
         return []
 
     @property
@@ -81,22 +81,22 @@ class Words(ABC):
 
     @property
     def threshold(self) -> str:
-        """From what on objects count, such as `probability 0.5`."""
+        """The threshold of listed objects, such as `probability 0.5`."""
         return f"{self.measure} {self.record.score_threshold:g}"
 
     @property
     def decided_by(self) -> str:
-        """What the number of the decision is: a `probability`, a `belief` without thresholds, or the best `score`."""
+        """Kind of the decision's number: `probability`, `belief` (without thresholds), or the best `score`."""
         return "probability"
 
     @property
     def value(self) -> str:
-        """What the value of a look is, for which it was chosen."""
+        """What the value of a look means, for which it was chosen."""
         return "the value of the acquisition function at its cell"
 
     @property
     def sensor(self) -> str | None:
-        """Through what was looked; None if it is not known."""
+        """The sensor or the windows, in words; None if they are not known."""
         return None
 
     @property
@@ -110,7 +110,7 @@ class Words(ABC):
 
     @property
     def classes(self) -> str:
-        """Number of the objects by class, the most frequent first, and how many of each to expect in all."""
+        """Number of the objects by class, the most frequent first, with the number of each to expect in all."""
         counts = Counter(self.record.objects.labels.tolist()).most_common()
         return ", ".join(
             f"{counted(count, self.record.classes[label])}{self._number_in_all(label)}" for label, count in counts
@@ -123,12 +123,11 @@ class Words(ABC):
     def verdict(self, name: str, colon: str = "") -> str:
         """Say what was decided, such as `cup probably absent`, or `no cup clearly seen: undecided`.
 
-        A target that is common is undecided with a high probability even where no look shows one, so that is said
-        first.
+        A common target may have a high probability although no look shows one; the words say so first.
 
         Args:
             name: the target, as it is written.
-            colon: what stands between it and what was decided.
+            colon: the text between the name and the decision.
 
         Returns:
             A few words.
@@ -157,7 +156,7 @@ class Words(ABC):
 
     @property
     def best_place(self) -> str:
-        """The most likely place of the target of a search that leaves it open; empty for others and without one."""
+        """The most likely place of a target that was not found, in words; empty if there is none."""
         place = self.record.best_place
         if place is None:
             return ""
@@ -199,14 +198,13 @@ class Words(ABC):
         return self._sentences.get("first found", sentence) if indices == [0] else sentence
 
     def assumption(self) -> str:
-        """Say how many pictures the probability assumes to hold the target, and what it would be with half of them.
+        """Say which share of pictures with the target the probability assumes, and what it would be with one half.
 
-        It is said where it matters: the target was not found, and with half of the pictures the probability would be
-        at least 0.1 higher or lower. So nothing is said where the assumed share is near one half, or where what was
-        seen leaves no doubt.
+        The sentence is empty unless it matters: the target was not found, and with one half the probability would be at
+        least 0.1 higher or lower.
 
         Returns:
-            The sentence; empty where it does not matter, or where it is not known what is assumed.
+            The sentence; empty also if the assumed share is not known.
         """
         record = self.record
         decision = record.decision
@@ -220,10 +218,10 @@ class Words(ABC):
         return f"This assumes that {share}; if half of them did, it would be {at_half:.2f} after these looks."
 
     def lack(self) -> str:
-        """Say what an undecided search lacked: a place that is sure, and what `found` takes.
+        """Say what an undecided search lacked for `found`: a place that is probable enough.
 
         Returns:
-            The sentence; empty for other decisions, and where it is not known what `found` takes.
+            The sentence; empty for other decisions, and if it is not known what `found` requires.
         """
         record = self.record
         decision = record.decision
@@ -239,18 +237,18 @@ class Words(ABC):
 
     @property
     def ended(self) -> str:
-        """Why it ended, and what an undecided search lacked; empty if neither is known."""
+        """Why the episode ended, and what an undecided search lacked; empty if neither is known."""
         return " ".join(filter(None, [self.why_it_ended(), self.lack()]))
 
     @property
     def remarks(self) -> list[str]:
-        """Sentences of doubt: what the search lacked, where its target is most likely, and what is assumed."""
+        """Sentences about doubts: what the search lacked, where the target is most likely, and what is assumed."""
         place = self.best_place.capitalize()
         sentences = [self.lack(), f"{place}." if place else "", self.assumption()]
         return [sentence for sentence in sentences if sentence]
 
     def summary(self) -> str:
-        """Describe the outcome, explain why it ended, and say what is in doubt.
+        """Describe the outcome, explain why the episode ended, and say what is in doubt.
 
         Returns:
             The sentences.

@@ -1,4 +1,4 @@
-"""How unlike the pictures of a fit a picture is, by what the feature maps of a detector show on average."""
+"""How unlike the pictures of a fit a picture is, by the means of a detector's feature maps."""
 
 from collections.abc import Iterable
 from typing import Self

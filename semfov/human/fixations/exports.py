@@ -56,10 +56,10 @@ def read_export(
     Event Detector; PyGaze (the lists `Efix` of PyGazeAnalyser, under the names `starttime`, `endtime`, `duration`,
     `endx` and `endy`); pymovements (events with a `location`); REMoDNaV; I2MC; iMotions; and EyeLink Data Viewer
     (fixation reports). Units are those in the names of the columns (`[MCS norm]`, `[μs]`), else those of the program,
-    as origins are. Lines that are no fixation, are not on the picture, or have no place are left out, and lines that
-    repeat the number of a fixation are one. Fixations without a picture are left out with a warning where others have
-    one, as between two pictures. In texts of the IDF Event Detector, a message with the name of a picture shows it
-    until the next such message, or until the trial is over.
+    as origins are. Lines that are no fixation, are not on the picture, or have no place are left out; lines with the
+    same number of a fixation count once. If some fixations have a picture, those without one, as between two pictures,
+    are left out with a warning. In texts of the IDF Event Detector, a message with the name of a picture shows it until
+    the next such message, or until the trial is over.
 
     Args:
         source: the file, or a `pandas.DataFrame`.

@@ -30,10 +30,10 @@ _BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')
 def read_fixations(source: str | PathLike[str] | DataFrame, **options: Any) -> list[Fixations]:
     r"""Read fixations from a file of any format that is known, or from a `pandas.DataFrame`.
 
-    Files `.asc`, and texts that begin as these, are those of EyeLink (`read_eyelink`), files `.json` those of
-    COCO-Search18, OSIE, or Ruarte and others. Other files are tables, as this library writes them (`read_table`) or as
-    the programs of eye trackers export them (`read_export`), which the columns tell, unless `columns` names those of
-    the points.
+    Files `.asc`, and texts that begin like them, are EyeLink's (`read_eyelink`); files `.json` are those of
+    COCO-Search18, OSIE, or Ruarte and others. All other files are tables, in the format of this library (`read_table`)
+    or of an eye tracker's program (`read_export`). The names of the columns decide which, unless `columns` names the
+    columns of the points.
 
     Args:
         source: the file or table.

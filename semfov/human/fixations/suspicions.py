@@ -41,7 +41,7 @@ _LONG = 5000.0
 
 
 def suspicions(fixations: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]] | None = None) -> list[str]:
-    """Say what is suspicious in fixations, in plain lines; none where nothing is.
+    """Say what is suspicious in fixations, in lines of plain text; none if nothing is.
 
     - Points that do not look like those of their frame: fractions, pixels or degrees from the centre, y before x, a
       smaller frame, or many outside it; with `sizes`, frames of other proportions than those of their pictures, and
@@ -90,7 +90,7 @@ def _of_frames(
 
 
 def other_frame_of(fixations: Sequence[Fixations], *, units: bool = True) -> str | None:
-    """Say what fixations look like that do not look like those of their frame.
+    """Say what unit, origin, axes or frame fixations look like, if not their own.
 
     Args:
         fixations: the records, at least one.
