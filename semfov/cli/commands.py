@@ -35,24 +35,24 @@ class Subcommand(NamedTuple):
 
 _AGENT = """\
   --detector NAME      yolox-nano (default), another name (semfov detectors), mine.onnx, or mine.cfg --weights FILE
-  --classes cat,dog    what an ONNX file lacks: names, --head, --colour; --remember them (semfov detectors --help)
-  --models FOLDER      from semfov fit (or one FILE.safetensors); --agent recommended (default), published, or raw"""
+  --classes cat,dog    names of the classes, if an ONNX file lacks them; --head and --colour (semfov detectors --help)
+  --models FOLDER      models from semfov fit (or FILE.safetensors); --agent recommended (default), published, or raw"""
 
 _LOOKS = """\
-  --how KIND           auto (default: windows of any picture), fovea, windows, or head (in a panorama)
-  --passes N           most passes of the detector; --shifts N: most gaze shifts of a fovea
-  --seconds S          longest time for a picture; --white auto: thermal or 12 bits; --bands 4,3,2: bands of a TIFF"""
+  --how KIND           how to look: auto (default; windows in any picture), fovea, windows, or head (in a panorama)
+  --passes N           at most N passes of the detector; --shifts N: at most N gaze shifts of a fovea
+  --seconds S          at most S seconds for a picture; --white auto: thermal or 12 bits; --bands 4,3,2: for a TIFF"""
 
 _OUTPUT = f"""\
   --out FILE           {suffixes_in_words()}; - is stdout
   --out FOLDER         results and figures of each picture (NAME.png: the figure of one); --draw scanpath,animation or
-                       none, for looks of a fovea also views,belief, and in a search belief_bars
-  --report PAGE.html   a page in which to step through the looks; --looks prints them; --quiet: errors alone
-  --crops FOLDER       what the box of each object shows, as JPEG; --labels FOLDER: labels in the format of YOLO
-  --workers N          processes (--scheduler tcp://HOST:8786: of a Dask cluster); --device cuda; --half: 16 bits
+                       none; with a fovea also views,belief, and in a search belief_bars
+  --report PAGE.html   a page in which to step through the looks; --looks prints them; --quiet: only errors
+  --crops FOLDER       a JPEG of each object; --labels FOLDER: labels in YOLO's format
+  --workers N          number of processes (or --scheduler tcp://HOST:8786, a Dask cluster); --device cuda; --half
 
-A picture of several that cannot be read is reported and skipped; the exit code is then 1. If a command with --out is
-stopped, the same command continues with the pictures that are left. --help-all: all options."""
+If one of several pictures cannot be read, it is reported and skipped, and the exit code is 1. If a command with --out
+was stopped, run it again: it continues with the pictures that are left. --help-all: all options."""
 
 _PICTURES = "photographs, large pictures, or folders of them (none: one that comes with semfov)"
 _DETECTOR = "the detector: a name or a file, as for semfov.load_detector"
@@ -76,14 +76,14 @@ semfov search: is it there, and where?
 
 usage: semfov search [PICTURE ...] --target CLASS [options]
 
-  PICTURE              pictures of any size, folders (--recursive: those in them too), patterns (none: a scene)
+  PICTURE              pictures of any size, folders (--recursive: subfolders, too), patterns (none: an example)
   --target CLASS       class to search for (semfov detectors NAME lists them)
   --embeddings FILE    word vectors; the target may then be a description, such as "something to drink from"
 {_AGENT}
 {_LOOKS}
-  --confirm P          found from this probability on; --stop-below P: stop if the chance of a new hit is lower
-  --closer N           most closer looks (0: none); --prior P: share of pictures with it, or fit (default: 0.5)
-  --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
+  --confirm P          least probability for found; --stop-below P: stop if the chance of a new hit is below P
+  --closer N           at most N closer looks; --prior P: share of the pictures that hold the class (default: 0.5)
+  --start 5,5          first cell of a fovea as column,row, or its number; --seed N: for a random one
 {_OUTPUT}
 """,
     ),
@@ -106,13 +106,13 @@ semfov find: all objects, and how many
 
 usage: semfov find [PICTURE ...] [--target CLASS,CLASS] [options]
 
-  PICTURE              pictures of any size, folders (--recursive: those in them too), patterns (none: a scene)
+  PICTURE              pictures of any size, folders (--recursive: subfolders, too), patterns (none: an example)
   --target CLASSES     a class, or several with commas (default: all classes)
 {_AGENT}
 {_LOOKS}
-  --min-gain N         in a large picture stop when the next look should show fewer new objects than this (default 0.01)
-  --score-threshold P  objects are listed from this probability on (default 0.5; without fitted models a score, 0.3)
-  --batch N            windows that are looked at together
+  --min-gain N         in a large picture, stop if a look is expected to show fewer new objects than N (default 0.01)
+  --score-threshold P  least probability of a listed object (default 0.5; without fitted models, least score 0.3)
+  --batch N            look at N windows at once
 {_OUTPUT}
 """,
     ),
@@ -134,12 +134,12 @@ semfov explore: what is where
 
 usage: semfov explore [PICTURE ...] [options]
 
-  PICTURE              pictures of any size, folders (--recursive: those in them too), patterns (none: a scene)
+  PICTURE              pictures of any size, folders (--recursive: subfolders, too), patterns (none: an example)
 {_AGENT}
 {_LOOKS}
-  --min-gain N         in a large picture stop when the next look should show fewer new objects than this, with a
-                       fovea when it should classify fewer more cells right (default 0.01 and 0.1)
-  --start 5,5          first cell of a fovea as column,row, or its number; --seed N draws it
+  --min-gain N         stop if a look is expected to show fewer new objects than N (default 0.01), with a fovea, to
+                       label fewer additional cells correctly than N (default 0.1)
+  --start 5,5          first cell of a fovea as column,row, or its number; --seed N: for a random one
 {_OUTPUT}
 """,
     ),
@@ -161,23 +161,23 @@ usage: semfov gaze [PICTURE ...] [options]
 
   PICTURE              photographs, or folders of them (none: one that comes with semfov)
   --detector NAME      the detector whose features are read: yolox-nano (default), yolov3-tiny, nanodet-plus-m-1.5x
-  --weights FILE       its weights, where they are not downloaded
+  --weights FILE       its weights, if they are not downloaded
   --model FILE         a model for your own detector or of your own fixations, from semfov fit
-  --quality best       six passes of the detector in place of one (quick): windows and a mirror image, too
+  --quality best       six passes of the detector instead of one (quick): also windows and a mirror image
   --panorama           pictures of 360°, whose left and right edge meet
-  --people N           viewers whose scanpaths are drawn (default 15); --seed N draws them
+  --people N           number of simulated viewers (default 15); --seed N: other viewers
   --seconds S          time for which each views a picture (default 3)
   --out FILE           scanpaths as .csv; for one picture the density as .npy or .tif, or a heat map as .png
-  --out FOLDER         scanpaths, and a heat map of each picture; with scanpaths comes a table of the pictures
+  --out FOLDER         scanpaths, a table of the pictures, and a heat map of each
   --report PAGE.html   a page with heat map, areas and scanpaths, in which to step through the fixations
-  --areas NAME:L,T,R,B areas, with what they get: left, top, right and bottom edge in pixels; or a file .json with
-                       {"logo": [10, 20, 200, 80]}, or with these by picture, {"before.png": {"logo": …}, …}
+  --areas NAME:L,T,R,B areas of interest: left, top, right and bottom edge in pixels; or a .json file with
+                       {"logo": [10, 20, 200, 80]}, or for several pictures {"before.png": {"logo": …}, …}
   --compare            two pictures side by side: both maps on one scale, and what differs (default: a page,
                        semfov-compare.html)
 
-If a command with --out of scanpaths or a folder is stopped, the same command continues with the pictures that are left.
-It learned from adults who looked at photographs for 3 to 5 seconds without a task. Where a picture is unlike these, as
-pages, charts, drawings and upright pictures are, it says so. --help-all: all options.
+If a command with --out was stopped, run it again: it continues with the pictures that are left. The models were fitted
+to adults who looked at photographs for 3 to 5 seconds without a task. A warning says if a picture is unlike these
+photographs, such as a page, a chart, a drawing or an upright picture. --help-all: all options.
 """,
     ),
     "live": Subcommand(
@@ -200,13 +200,13 @@ usage: semfov live [VIDEO | FOLDER | URL | --camera N] [--target CLASS | --find 
   VIDEO, FOLDER, URL   a video file, a folder of frames, or an address such as rtsp://… that OpenCV can open
   --camera N           number of a camera; Ctrl-C ends it
   --target CLASS       class to search for (default: explore)
-  --find CLASSES       classes, with commas, of which all objects are to be found
-  --how KIND           auto (default: windows of any frame), fovea, or windows
+  --find CLASSES       find all objects of these classes, separated by commas
+  --how KIND           how to look: auto (default; windows in any frame), fovea, or windows
   --frames N           number of frames (default: the whole video; a camera until Ctrl-C)
   --rate R             rate at which evidence fades, per second (0: never; default: 2.5 for a fovea, 0.75 for windows)
-  --confirm P          found from this probability on; --stop-below P: no closer look if the chance of a hit is lower
-  --closer N           most closer looks in the time until half of the evidence has faded (0: none)
-  --prior P            share of the frames that hold the target, or fit: that of the fit (default: 0.5)
+  --confirm P          least probability for found; --stop-below P: least chance of a hit for a closer look
+  --closer N           at most N closer looks in the time until half of the evidence has faded
+  --prior P            share of the frames that hold the target (default: 0.5)
 {_AGENT}
   --start 5,5          first cell as column,row, or its number; --seed N draws it
   --out FILE           video to write (.mp4 or .avi), with gaze and belief, or windows and objects
@@ -222,7 +222,7 @@ Videos need OpenCV: pip install opencv-python-headless. --help-all lists all opt
         options="cli.options:CompareOptions",
         function="cli.compare:compare",
         help=f"""\
-semfov compare: what semfov finds over seconds, beside slices of the same pictures
+semfov compare: what semfov finds in a given time, compared with slices of the same pictures
 
   semfov compare flight/ --with sahi --target person
   semfov compare flight/ --with sahi,ranked --target person --annotations instances.json
@@ -234,15 +234,15 @@ usage: semfov compare [PICTURE ...] [--with sahi,ranked] [options]
   --with WAYS          sahi: the whole picture and all its slices (default); ranked: the slices with the highest scores
                        of the whole picture first
   --target CLASSES     a class, or several with commas (default: all classes)
-  --annotations FILE   the truth, in COCO's format; without it, what all slices list stands for it
+  --annotations FILE   the true boxes, in COCO's format; without it, the objects found in all slices count as true
 {_AGENT}
-  --passes N           most passes of the detector for a picture (default 24)
+  --passes N           at most N passes of the detector for a picture (default 24)
   --slice N            side of a slice in pixels (default: of the detector's input); --overlap S (default 0.2)
   --out FOLDER         compare.html, compare.csv and compare.png (default: the folder semfov-compare)
-  --quiet              errors alone; --device cuda; --white auto and --bands 4,3,2 as for semfov find
+  --quiet              only errors; --device cuda; --white auto and --bands 4,3,2 as for semfov find
 
-SAHI itself is not needed: semfov cuts the slices by its rule, looks at them, and merges what they show. Seconds are
-those of this machine. --help-all: all options.
+SAHI need not be installed: semfov cuts the slices by SAHI's rule, and merges their objects. Seconds are measured on
+this machine. --help-all: all options.
 """,
     ),
     "demo": Subcommand(
@@ -260,11 +260,11 @@ semfov demo: what semfov does, as a page
 usage: semfov demo [--out FILE.html]
 
   --out FILE           the page to write (default: semfov-demo.html), one file that loads nothing from elsewhere
-  --quiet              errors alone
+  --quiet              only errors
 
 The page shows a search for a dog, all people on a sheet of five photographs with each window that was looked at, where
-people look, and a stream. They are computed when you run it, by the detector and in the photographs that come with
-semfov: nothing is downloaded. Under each stands the command for a picture of your own.
+people look, and a stream. All are computed when you run the command, with the detector and the photographs in the
+package: nothing is downloaded. Below each is the command for a picture of your own.
 """,
     ),
     "app": Subcommand(
@@ -274,7 +274,7 @@ semfov: nothing is downloaded. Under each stands the command for a picture of yo
         options="cli.options:AppOptions",
         function="cli.app:serve",
         help=f"""\
-semfov app: a page in the browser on which to try the agent out
+semfov app: try the agent on a page in the browser
 
   semfov app                                           (pip install "semfov[app]")
   semfov app yolox-nano --port 8000
@@ -283,13 +283,13 @@ semfov app: a page in the browser on which to try the agent out
 usage: semfov app [DETECTOR] [options]
 
 {_AGENT.partition(chr(10))[2]}
-  --host ADDRESS       address to serve the page on (default 127.0.0.1: this machine alone; others need the token in
-                       the address that is printed)
+  --host ADDRESS       address to serve the page on (default 127.0.0.1: only for this machine; others need the token in
+                       the printed address)
   --port N             its port (default: the first free one from 7860 on)
 
-A photograph is there: press Look. Or give it a picture of yours, and find all objects, search for a class, explore, or
-predict where people look. Or look yourself: the fovea follows the pointer, and a click looks; can you find it in fewer
-looks than the agent? Nothing is sent elsewhere; pictures are deleted after an hour, and at the end. Ctrl-C ends it.
+Press Look to search the photograph on the page. Or open a picture of your own, and find all objects, search for a
+class, explore, or predict where people look. Or look yourself: the picture is sharp around your pointer, and each click
+is a look. Nothing is sent elsewhere; pictures are deleted after an hour, and at the end. Ctrl-C ends the command.
 """,
     ),
     "mcp": Subcommand(
@@ -305,7 +305,7 @@ semfov mcp: tools for language models, by the Model Context Protocol
 
 usage: semfov mcp FOLDER [options]
 
-  FOLDER               the folder with the pictures (default: this one); files elsewhere are refused, also by links
+  FOLDER               the folder with the pictures (default: this one); files outside are refused, also by links
 {_AGENT}
 
 A program with a language model starts this command, and talks to it on standard input and output:
@@ -313,7 +313,7 @@ A program with a language model starts this command, and talks to it on standard
   {{"mcpServers": {{"semfov": {{"command": "semfov", "args": ["mcp", "PICTURES"]}}}}}}
 
 The tools are pictures, search, find, look (a crop, as a picture), where_people_look and check. Each answer has places,
-probabilities, the passes that were spent, and what further looks can bring. Nothing is written or sent elsewhere.
+probabilities, the passes used, and how many objects are still to be expected. Nothing is written or sent elsewhere.
 """,
     ),
     "check": Subcommand(
@@ -327,22 +327,22 @@ semfov check: is a file of fixations what it seems to be?
 
   semfov check people.csv
   semfov check tobii.tsv recordings/*.asc
-  semfov check fixations.csv --size 1600,1200 --picture scene.mp4      (Pupil Cloud, whose tables have neither)
-  semfov check fixations.csv --picture PICTURES      (also by what lies under the fixations)
+  semfov check fixations.csv --size 1600,1200 --picture scene.mp4      (for Pupil Cloud, whose tables have neither)
+  semfov check fixations.csv --picture PICTURES      (also compares the fixations with the pictures)
 
 usage: semfov check FILE [FILE ...] [options]
 
   FILE                 a table of fixations, as semfov, Tobii, Pupil Labs, PsychoPy, PyGaze, Gazepoint, pymovements or
                        EyeLink Data Viewer write it, an ASC file of EyeLink, or JSON of COCO-Search18 or OSIE
-  --picture FOLDER     the pictures, or one picture (kitchen.jpg), whose sizes are compared with the frames, and are the
-                       frames where the file has none
-  --picture NAME       the picture's name, where the file has none; --subject NAME and --size W,H (the frame) likewise
-  --quiet              errors alone
+  --picture FOLDER     the pictures, or one picture (kitchen.jpg): their sizes are compared with those in the file, or
+                       used if the file has none
+  --picture NAME       the picture's name, if the file has none; likewise --subject NAME, and --size W,H (of the frame)
+  --quiet              only errors
 
-It tells frames, units, origins and axes that do not fit, letterboxes, repeats, blinks and odd durations. With five
-pictures or more it also compares the fixations with where people look in them: y upwards, mirrored, the size at which
-pictures were shown, wrong names, a calibration that was off; --rules-alone leaves that out. The exit code is 1 if
-anything is suspicious. --help-all: all options.
+The command reports wrong frames, units, origins and axes, letterboxes, repetitions, blinks and implausible durations.
+With five pictures or more it also compares the fixations with where people look in them, and recognises y upwards,
+mirrored pictures, a wrong size on the screen, wrong names and a shifted calibration (--rules-alone: without this). The
+exit code is 1 if anything is suspicious. --help-all: all options.
 """,
     ),
     "fit": Subcommand(
@@ -362,20 +362,20 @@ semfov fit: fit all models to your own detector
 usage: semfov fit MODEL [--data.root FOLDER --data.annotations FILE] [options]
 
   MODEL                    the detector: a name or a file, as for semfov.load_detector
-  --data.root FOLDER       photographs to learn from; a few dozen with boxes are enough to begin with
-  --data.annotations FILE  their boxes in COCO's format (none: embedded scenes, enough only to try it out)
-  --data.limit N           use only so many photographs
-  --detector.classes LIST  names of the detector's classes, "[cat,dog]", where its file does not hold them
+  --data.root FOLDER       photographs for the fit; a few dozen with boxes are enough to begin with
+  --data.annotations FILE  their boxes in COCO's format (none: the photographs in the package, as a trial)
+  --data.limit N           use only N photographs
+  --detector.classes LIST  names of the detector's classes, "[cat,dog]", if its file lacks them
   --out FOLDER             folder for the models (default mymodels)
-  --holdout N              hold out one in N photographs, on which each part is compared with raw scores
-  --columns N, --rows N    cells of the fovea's grid (default 10 × 10); searches with these models have them
-  --gaze.fixations FILES   what people fixated, in formats that semfov check reads; without photographs, nothing else is
-                           fitted. --gaze.pictures FOLDERS: the folder of the pictures of each file
-  --windows false          no evidence for large pictures (it takes about 50 photographs, of which mosaics are made)
-  --workers N              processes that look (default: one for each core)
+  --holdout N              hold out one in N photographs, on which each model is compared with raw scores
+  --columns N, --rows N    cells of the fovea's grid (default 10 × 10), also in searches with these models
+  --gaze.fixations FILES   fixations of people, in a format that semfov check reads; without photographs, only the gaze
+                           model is fitted. --gaze.pictures FOLDERS: the folder of the pictures of each file
+  --windows false          fit no models for large pictures (they need about 50 photographs)
+  --workers N              number of processes (default: one for each core)
 
-It writes the models, a report with figures, and a manifest. The agent uses only the parts that are better than raw
-scores on photographs that were held out. After an interruption the same command continues. --help-all: all options.
+The command writes the models, a report with figures, and a manifest. The agent uses a model only if it is better than
+raw scores on the held-out photographs. If the command was stopped, run it again: it continues. --help-all: all options.
 """,
     ),
     "detectors": Subcommand(
@@ -385,9 +385,9 @@ scores on photographs that were held out. After an interruption the same command
         options="cli.options:DetectorsOptions",
         function="cli.detectors:show",
         help="""\
-semfov detectors: detectors that can be named, or the classes of one
+semfov detectors: the detectors that have a name, or the classes of one
 
-  semfov detectors                 names, licences, sizes, what is there already, and what models are shipped
+  semfov detectors                 names, licences, sizes, which are on this machine, and which have fitted models
   semfov detectors yolox-nano      the classes that it knows
   semfov detectors mine.onnx --try kitchen.jpg
   semfov detectors mine.onnx --head yolov8 --classes cat,dog --colour bgr --remember
@@ -395,14 +395,15 @@ semfov detectors: detectors that can be named, or the classes of one
 usage: semfov detectors [NAME] [options]
 
   NAME                 name or file of a detector, as for semfov.load_detector, or a folder of models
-  --try PHOTO          what the bare detector shows beside what semfov lists, and what its file may have lost
-  --head, --colour     what an ONNX file takes and returns; --logits, --input-size N, --per-class (suppression of boxes)
-  --classes cat,dog    names of its classes, or a file with a name a line
-  --remember           write these beside the file, mine.json for mine.onnx, where every command reads them
+  --try PHOTO          compare the bare detector's boxes with the objects that semfov lists, and warn of a damaged file
+  --head, --colour     the form of an ONNX file's outputs, and the order of its colours; --logits, --input-size N,
+                       --per-class (suppression of boxes)
+  --classes cat,dog    names of its classes, or a file with one name in each line
+  --remember           write these settings to a file, mine.json for mine.onnx, which every command reads
   --weights FILE       weights of a .cfg; --device cuda
 
-Weights of the default, yolox-nano, are in the package. Those of others are downloaded when they are first used, into
-$SEMFOV_CACHE or the user's cache folder. A detector without shipped models runs with --agent raw, or after semfov fit.
+Weights of yolox-nano, the default, are in the package. Others are downloaded at the first use, to $SEMFOV_CACHE or
+the user's cache folder. A detector without shipped models needs --agent raw, or semfov fit first.
 """,
     ),
 }
