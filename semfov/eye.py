@@ -37,9 +37,9 @@ class View(NamedTuple):
 class Eye(StatedModule):
     """Applies a sensor to an image at the detector's resolution, and detects objects in the result.
 
-    The image is first fitted into the detector's input, the canvas, and the sensor is applied there. An eye with a
-    fixed number of receptors does the same, and it costs less than blurring every pixel of the photograph. The
-    settings of the sensor are scaled from an image whose longer side is `reference` to the canvas.
+    The image is first fitted into the detector's input, the canvas, and the sensor is applied there, which costs less
+    than blurring every pixel of the photograph. The settings of the sensor are scaled to the canvas, from an image
+    whose longer side is `reference`.
 
     Args:
         sensor: `Foveation`, `LogPolar`, `MultiScaleFovea` or any other `semfov.sensor.Sensor`, with settings in pixels

@@ -50,15 +50,15 @@ def window_eye(
 class ZoomAgent(nn.Module):
     """Search and explore pictures that are larger than the detector's input.
 
-    Each look is a window at a magnification and costs one pass of the detector. The agent looks where it expects to
-    find most, as closely as it takes to find it. Without evidence it learns nothing: after the overview it looks at
-    slices in the order of the overview's scores in them (`semfov.zoom.slices`). `semfov fit` makes evidence for a
-    detector of your own, with which fewer passes find as much, and searches end early and can decide `absent`.
+    Each look is a window at a magnification and costs one pass of the detector. The agent chooses the window in which
+    it expects to find most. Without evidence, it looks at slices after the overview, in the order of the overview's
+    scores in them (`semfov.zoom.slices`). `semfov fit` makes evidence for a detector of your own; with it fewer passes
+    find as much, and searches end early and can decide `absent`.
 
     Args:
         eye: resamples a window and detects in it.
         evidence: predicts from a look what closer looks will find; None for slices.
-        photographs: whether windows also suit photographs, which the detector sees whole, without evidence.
+        photographs: whether to look through windows at photographs, too, if there is no evidence for them.
 
     Attributes:
         classes: names of the classes, background first.

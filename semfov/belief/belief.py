@@ -40,8 +40,8 @@ def with_fields(instance: _DataClass, change: Callable[[Any], Any]) -> _DataClas
 class Belief(OtherWords, ABC):
     """Base of all beliefs about the cells of an image, for a batch of episodes.
 
-    A subclass implements `probability`, and is a dataclass of tensors `(B, ...)`, of other beliefs, also in tuples, and
-    of values that all episodes share. One that holds its tensors in another way implements `map`, too.
+    A subclass implements `probability`. It is a dataclass whose fields are tensors `(B, ...)`, other beliefs, tuples of
+    these, or values that all episodes share; a subclass with other fields also implements `map`.
 
     Attributes:
         closest: `(B, X·Y)`, distance from each cell to the closest fixation so far, in units of the image's longer

@@ -37,9 +37,9 @@ class CocoScenes(Scenes):
     are not in `classes` and, with `crowd="drop"`, boxes of crowds. `repairs` counts the boxes of the whole file that
     were cut or dropped, and a warning of the logger `semfov.data.coco` lists them. Any other error in the file raises.
 
-    Photographs are turned upright by their EXIF orientation, as viewers and programs for annotation show them. Where
-    only the stored pixels have the size that the file states, boxes are turned with them. Where the size does not tell
-    (the stored photograph is square, upside down or mirrored), boxes are those of the upright one.
+    Photographs are turned upright by their EXIF orientation, as viewers and programs for annotation show them. Boxes
+    refer to the upright photograph. If the size in the annotation file is that of the photograph before turning, boxes
+    are turned with it; a photograph that is square, upside down or mirrored has the same size before and after.
 
     Args:
         root: folder of the images.

@@ -21,8 +21,8 @@ EXAMPLES = (*(photograph.name for photograph in PHOTOGRAPHS), "sheet")
 def example(name: str) -> Tensor:
     """Read an example picture, which comes with the package.
 
-    They are photographs of Flickr Commons without known copyright restrictions, and a sheet of them, which is a large
-    picture.
+    The examples are photographs from Flickr Commons without known copyright restrictions, and one large picture, a
+    sheet of them.
 
     Args:
         name: `beach`, `market`, `lifeboat`, `aeroplane`, `farm` or `sheet`.

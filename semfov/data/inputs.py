@@ -58,8 +58,8 @@ def as_image(
     - A Pillow image of any mode: it is turned upright, and transparent pixels are blended with white.
     - A NumPy array or a tensor of shape `(3, H, W)` or `(H, W, 3)`, or grey of shape `(H, W)`, `(1, H, W)` or
       `(H, W, 1)`, or a batch of one such picture. Floats must lie in [0, 1]; bytes and 16-bit numbers are divided by
-      their largest value. Channels are RGB, or with `color="bgr"` as OpenCV reads them. A tensor of shape `(3, H, 3)`
-      is taken as channels first.
+      their largest value. Channels are RGB, or with `color="bgr"` as OpenCV reads them. In shape `(3, H, 3)` the
+      channels are first.
 
     Gradients flow through tensors.
 
@@ -69,8 +69,8 @@ def as_image(
             to float32, and leaves the picture on its device.
         argument: name of the argument, for the message.
         color: order of the channels of arrays and tensors. Files and Pillow images know their own.
-        white: the value that is white where 0 is black, the values `(black, white)`, or `auto` for percentiles, of
-            numbers of any type (`semfov.read_image`); None as said above.
+        white: the value of white (0 is black), the values `(black, white)`, or `auto` for percentiles, for numbers of
+            any type (`semfov.read_image`); None: as said above.
 
     Returns:
         `(3, H, W)`, RGB.

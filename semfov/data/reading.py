@@ -38,9 +38,8 @@ def read_image(
         path: a file of JPEG, JPEG 2000, PNG, WebP, AVIF, TIFF, GIF, BMP or PPM, whatever its name, and of HEIF where
             pillow-heif is registered.
         oriented: whether to apply the EXIF orientation; False is for annotations of the pixels as they are stored.
-        white: the value that is white where 0 is black, such as 4095 for 12 bits; the values `(black, white)`; or
-            `auto`, for the 1st and the 99th percentile. None: the largest value of the bits that the file states, and
-            1 for floats.
+        white: the value of white (0 is black), such as 4095 for 12 bits; the values `(black, white)`; or `auto`, for
+            the 1st and the 99th percentile. None: the largest value of the file's number of bits, or 1 for floats.
         bands: the number of a band of a TIFF or a raster, or three for red, green and blue, from 1; None for those that
             the file names.
 

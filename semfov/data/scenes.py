@@ -88,13 +88,13 @@ class _Part(NamedTuple):
 
 
 class EmbeddedScenes(ComposedScenes):
-    """Five photographs: a beach, a market, a lifeboat, an aeroplane and a farm; after them, parts of them.
+    """Five photographs (a beach, a market, a lifeboat, an aeroplane and a farm), followed by parts of them.
 
     Scene `i` depends only on the seed and on `i`. With seed 0, the first five are the whole photographs. All others are
     parts, some of them mirrored, of 60 to 100 % of a photograph's sides. Objects are people, boats, lorries, cars,
-    horses, dogs, an aeroplane, handbags and ties; those of classes that the detector does not have are shown without a
-    box. The photographs are old, of Flickr Commons, and have no known copyright restrictions. They are enough to try
-    something out, not to measure it.
+    horses, dogs, an aeroplane, handbags and ties; if the detector lacks a class, its objects have no box. The
+    photographs are old ones from Flickr Commons without known copyright restrictions. They suffice to try something
+    out, but not to measure it.
 
     Args:
         classes: names of the detector's classes 1..K, in COCO's or Darknet's spelling.

@@ -56,20 +56,21 @@ def _vectors_of(labels: Tensor, scores: Tensor | None, classes: int) -> Tensor:
 class Detections:
     """A padded batch of detections, each with a score for every class and for background.
 
-    Beliefs read the score vectors, whose classes share what background leaves. Lists, drawings and thresholds read the
-    confidence, the number that the bare detector shows: with many classes a share is often far below it.
+    Beliefs read the score vectors, in which the classes share what background leaves. Lists, drawings and thresholds
+    read the confidence, the number that the bare detector shows. With many classes, the largest score in the vector is
+    often far below it.
 
     Attributes:
         boxes: `(..., L, 4)`, `(x1, y1, x2, y2)` in pixels of the detector's input image.
         scores: `(..., L, K+1)`, score vectors that sum to 1; index 0 is background, 1..K are the detector's classes.
-        mask: `(..., L)`, true where a row is a detection and false where it is padding; None takes every row for one.
-        confidence: `(..., L)`, the detector's own score of the best class, 0 for padding; None takes the largest score
-            of a class from the vectors.
-        highest: `(..., K+1)`, the highest score of each class in the whole image, in the vectors of candidates that are
-            too faint for a detection, too; None takes that of the detections.
+        mask: `(..., L)`, true if a row is a detection, and false if it is padding; None: all rows are detections.
+        confidence: `(..., L)`, the detector's own score of the best class, 0 for padding; None: the largest score of a
+            class in the vector.
+        highest: `(..., K+1)`, the highest score of each class in the whole image, also among candidates that are too
+            faint for a detection; None: among the detections.
 
-    Detections are in descending order of their largest score of a class in the vectors, in which beliefs fuse them,
-    with padding last.
+    Detections are sorted by the largest score of a class in their vectors, the order in which beliefs fuse them;
+    padding comes last.
 
     Other libraries store one class and one score for each box: the best class other than background, and the
     confidence. Where a library can store further data, the full score vector is stored too, and converting back is

@@ -49,9 +49,9 @@ class Detector(StatedModule, ABC):
         stride: pad the canvas only to a multiple of this number of pixels; None pads it to `input_size`.
         stretch: whether images are stretched to the canvas instead of letterboxed.
         corner: whether letterboxed images are in the upper left corner of the canvas instead of its middle.
-        faint: confidence from which on a candidate counts, though it is no detection: as a hint of where to zoom in
+        faint: least confidence of a candidate that is no detection but a hint: of where to zoom in
             (`semfov.zoom.hints`), and of what the picture holds (`Detections.highest`).
-        score_threshold: score from which on a detection counts: two of three are right.
+        score_threshold: least score of a listed detection; about two of three should be right.
         digest: sha256 of the weights, `""` for random weights.
 
     A detector that proposes the whole canvas as one box:

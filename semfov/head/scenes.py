@@ -526,7 +526,7 @@ def _limited(angle: float, most: float) -> float:
 class Flat(_Plane):
     """A large picture in front of the viewer, seen through a window that moves over it.
 
-    The picture is taken to be far away, so that the number of pixels per degree is the same everywhere. A pose is the
+    The picture is assumed to be far away, so the number of pixels per degree is the same everywhere. A pose is the
     middle of the window, in degrees to the right of and above the middle of the picture, and the window's width in
     degrees. Points are pixels, so D is 2.
 
@@ -536,8 +536,8 @@ class Flat(_Plane):
         size: `(w, h)` of a view in pixels.
         fields: fields of view in degrees, narrowest first; with several of them the head can zoom.
         speeds: of eye and head.
-        degree: number of pixels of the picture per degree. None takes 640 pixels for 60 degrees, and fewer where the
-            widest view would not fit into the picture.
+        degree: number of pixels of the picture per degree. None: 640 pixels for 60 degrees, or fewer if the widest view
+            would not fit into the picture.
         cell: height of the scene's cells in degrees.
         color: order of the channels of an array or a tensor (`semfov.as_image`).
 

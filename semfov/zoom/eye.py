@@ -69,17 +69,17 @@ class WindowEye(nn.Module):
     """Looks at windows of a picture: resamples a window to the detector's input and detects in it.
 
     A look costs one pass of the detector, whatever the size of the picture. The borders of windows are rounded to whole
-    pixels. In pictures of more than 16 million pixels those of coarse windows are rounded to pixels of a reduced copy
-    (`semfov.data.windowed`). Windows are resampled as bytes by the antialiased filter of `semfov.sensor.glimpse`, from
-    the pixels inside them alone.
+    pixels. In pictures of more than 16 million pixels, the borders of windows at low magnification are rounded to
+    pixels of a reduced copy (`semfov.data.windowed`). Windows are resampled as bytes by the antialiased filter of
+    `semfov.sensor.glimpse`, from the pixels inside them alone.
 
     Where the border of a window cuts an object, only a part of the object is visible, and its box encloses that part.
     Such boxes can be kept (`keep`), left out (`drop`), or kept with the scores of background (`background`). The border
     of the picture cuts no object.
 
-    A window that reaches beyond the picture shows less than the canvas holds. Padding surrounds what it shows, or it
-    fills the canvas, with other proportions by a factor of 4 at most. Agents look as their evidence was fitted
-    (`semfov.agents.windows`), which may be with padding for a detector that was trained with stretched pictures.
+    If a window reaches beyond the picture, its part of the picture is padded to the canvas, or stretched to it by a
+    factor of at most 4 in proportions. Agents pad or stretch as their evidence was fitted (`semfov.agents.windows`),
+    even if the detector was trained in the other way.
 
     Args:
         detector: any detector.
