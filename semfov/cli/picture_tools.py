@@ -219,7 +219,7 @@ class PictureTools:
 
     @_one_at_a_time
     def check(self, fixations: str) -> list[str]:
-        """Say what is suspicious in a file of fixations, beside the pictures of the folder.
+        """Say what is suspicious in a file of fixations, compared with the pictures of the folder.
 
         Args:
             fixations: the file's path from the folder.

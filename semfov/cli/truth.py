@@ -22,10 +22,10 @@ from semfov.paths.conversion import Values
 class Truth:
     """An annotation file in COCO's format: pictures by the ends of their paths, and categories by their names.
 
-    Boxes are in the frame whose size the file states, as in `semfov.data.CocoScenes`: that of the upright picture, as
-    viewers and programs for annotation show it, or where only the stored pixels have that size, that of these. Where
-    the size does not tell (none is stated, or the stored picture is square, upside down or mirrored), boxes are those
-    of the upright picture.
+    Boxes refer to the upright picture, as viewers and programs for annotation show it; but if only the stored picture
+    has the size that the file states, they refer to the stored one (as in `semfov.data.CocoScenes`). Where the size
+    does not tell (none is stated, or the stored picture is square, upside down or mirrored), boxes are those of the
+    upright picture.
     """
 
     def __init__(self, path: Path) -> None:

@@ -66,11 +66,11 @@ class Judgement(NamedTuple):
 class PlaceVerifier(ABC, Generic[LookType]):
     r"""Base of what decides one search by looks, and by closer looks at the places that seem to hold the target.
 
-    It makes no look itself. After each one (`see`) it names the place that is to be looked at closely (`candidate`),
-    the most evident one, if it is probable enough, and is told what a closer look shows (`examine`). The search ends at
-    once with a place that is sure, after `MOST_CLOSER` closer looks with one from `confirm` on, and with the best one
-    when it is over: when no look is worth a pass, or `most` closer looks were made (the table in `semfov.decision`).
-    Where all places are examined (`CandidatePlaces.exhaustive`) none ends it at once, as the next may be surer.
+    It makes no look itself. After each look (`see`) it names the most evident place for a closer look (`candidate`), if
+    it is probable enough; `examine` tells it what the closer look shows. The search ends at once with a place that is
+    sure, after `MOST_CLOSER` closer looks with one from `confirm` on, and with the best one when it is over: when no
+    look is worth a pass, or `most` closer looks were made (the table in `semfov.decision`). Where all places are
+    examined (`CandidatePlaces.exhaustive`) none ends it at once, as the next may be surer.
 
     Closer looks may follow a look at once (`look_closely`), or take frames of their own in a stream. Their
     probabilities then fade towards the belief. With the rate r of the candidates' `Forgetting`, after a seconds

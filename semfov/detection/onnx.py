@@ -316,9 +316,9 @@ def load_onnx(
 ) -> OnnxDetector:
     """Load a detector from an ONNX file, or a published one by its name.
 
-    What an option does not say is taken from `model.json` beside the file, then from the metadata of the model, and
-    then found out: the head by names and shapes of the outputs, and names of classes in a file beside it
-    (`names_beside`).
+    Options that are not given are read from `model.json` in the file's folder, or else from the metadata of the model.
+    Otherwise the head is recognised by names and shapes of the outputs, and names of classes are read from a file in
+    the folder (`names_beside`).
 
     Args:
         name_or_path: the ONNX file, or the name of a published model.

@@ -40,7 +40,7 @@ class _SceneEvidence(Evidence):
 
 @dataclass(frozen=True, repr=False)
 class SceneBelief(Belief):
-    """Belief about the S cells of a scene, of which each takes that of the view whose gaze came closest to it.
+    """Belief about the S cells of a scene; each has the belief of the view in which the gaze came closest to it.
 
     Attributes:
         values: of one target `(1, S, 2)`, its probability, and that if no fixated cell has it; or of all classes
@@ -75,7 +75,7 @@ class SceneBelief(Belief):
 
 
 class SceneObserver(Observer):
-    """Keeps the belief about a scene; a cell takes that of the view in which the gaze came closest to it."""
+    """Keeps the belief about a scene; each cell has the belief of the view in which the gaze came closest to it."""
 
     by_target = True
 

@@ -41,7 +41,7 @@ def cumulative_performance(found_at: NDArray[np.int64], shifts: int) -> FloatArr
 
 
 def scores_by_presence(score: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-    """Divide scores into those of the cases with the target, and of those without.
+    """Divide scores into two groups: cases with the target, and cases without.
 
     Args:
         score: `(M,)`.

@@ -12,7 +12,7 @@ from semfov.paths.look import Box, RecordedLook, cell_columns, finite_or_none
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class FoveaLook(RecordedLook):
-    """One look of a fovea: a fixation, or a closer look at a place of the photograph itself.
+    """One look of a fovea: a fixation, or a closer look, which enlarges a place of the photograph.
 
     Attributes:
         cell: the fixated cell, or the cell of the place.

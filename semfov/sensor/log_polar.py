@@ -138,7 +138,7 @@ def from_log_polar(
 ) -> Tensor:
     """Project cortical images back to images, by bicubic interpolation between receptors.
 
-    At the fixation the innermost ring is continued by itself, turned by half a turn.
+    Within the innermost ring, a point is interpolated between this ring and its opposite side.
 
     Args:
         cortical: `(B, C, M, N)` or `(B, G, C, M, N)`, from `log_polar`.

@@ -134,7 +134,7 @@ class Tracks:
 
     @property
     def velocities(self) -> Tensor:
-        """Their velocities, `(N, 2)`, in pixels a second beside that of the scene."""
+        """Their velocities relative to the scene, `(N, 2)`, in pixels a second."""
         return torch.from_numpy(self.kinematics.velocity).float()
 
     @property

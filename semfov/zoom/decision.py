@@ -314,8 +314,9 @@ def decisions_of(
         thresholds   of presence: its `stop_below` ends searches, and its `confirm` finds where no closer look is made
         places       of places after closer looks: its `confirm` finds. None for no closer looks
 
-    Places take the `stop_below` of presence, too, which the setting replaces. The setting `confirm` replaces that of
-    places, and where no closer look is made that of presence. In files of models `stop_below` is named `give_up`.
+    Places take the `stop_below` of presence, too, which the setting replaces. The setting `confirm` replaces the
+    threshold of places, or without closer looks the threshold of presence. In files of models `stop_below` is named
+    `give_up`.
 
     Args:
         belief: the belief of the search, before the first look.

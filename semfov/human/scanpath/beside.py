@@ -1,4 +1,4 @@
-"""One scanpath beside those of people in the same picture, by the measures of this folder."""
+"""Comparison of one scanpath with people's scanpaths in the same picture, by the measures of this folder."""
 
 from collections.abc import Callable, Iterable, Sequence, Sized
 from functools import partial
@@ -50,7 +50,7 @@ class BesidePeople(NamedTuple):
 
 
 class ScanpathComparison(dict[str, BesidePeople]):
-    """Measures of a scanpath beside those of people, by name; printed as a table.
+    """Measures between a scanpath and people, and between people, by name; printed as a table.
 
     >>> print(ScanpathComparison({"AUC": BesidePeople(0.85, 0.9)}))
     measure  scanpath  people
