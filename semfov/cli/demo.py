@@ -71,9 +71,7 @@ def _show_search(agent: ActivePerception) -> DemoPart:
     beach = example("beach")
     records: list[Record] = []
     found = agent.search(beach, "dog", on_look=records.append)
-    captions = [
-        "dog: undecided" if record.decision is None else f"dog: {record.decision.outcome}" for record in records
-    ]
+    captions = [f"dog: {record.verdict or 'undecided'}" for record in records]
     frames = opening_frames(records, pillow(beach), agent.eye.detector.input_size, captions, _WIDTH)
     return DemoPart(
         heading="Search: is there a dog, and where?",

@@ -191,9 +191,9 @@ class _Sums:
     def add(self, moment: Moment) -> None:
         """Add the objects or the decision of a frame."""
         self._frames += 1
-        if moment.decision is not None:
+        if moment.verdict:
             self._target = moment.target_name
-            self._frames_found += moment.decision.outcome == "found"
+            self._frames_found += moment.verdict == "found"
             return
         numbers = moment.objects.track_ids if isinstance(moment, WindowMoment) else None
         if numbers is None:

@@ -240,7 +240,7 @@ class PictureOutcome:
         form = None if out is None else results_format(out, truth=truth)
         figures = _draw_episode(record, boxes, _drawings(options))
         return cls(
-            ended="looked at" if record.decision is None else record.decision.outcome,
+            ended=record.verdict or "looked at",
             text=text,
             row=_result_row(record, source, seconds, form),
             episode=episode,

@@ -203,9 +203,14 @@ class Outcome(ABC):
         return (x1 + x2) / 2, (y1 + y2) / 2
 
     @property
+    def verdict(self) -> str:
+        """What a search decided: `found`, `absent` or `undecided`; empty where nothing was decided."""
+        return "" if self.decision is None else self.decision.outcome
+
+    @property
     def _find(self) -> Decision | None:
         """The decision of a search that has found its target; None for others."""
-        return self.decision if self.decision is not None and self.decision.outcome == "found" else None
+        return self.decision if self.verdict == "found" else None
 
     @property
     def image(self) -> Tensor | None:
@@ -377,8 +382,8 @@ class Outcome(ABC):
     def _outcome(self) -> tuple[Objects, Tensor]:
         """The objects, and which of them were confirmed; none of a search that is over without a find."""
         objects, confirmed = self._shown_objects
-        is_over = self.decision is not None and not self._goes_on
-        return (objects[:0], confirmed[:0]) if is_over and self._find is None else (objects, confirmed)
+        has_ended_without_find = self.verdict in ("absent", "undecided") and not self._goes_on
+        return (objects[:0], confirmed[:0]) if has_ended_without_find else (objects, confirmed)
 
     @cached_property
     def _shown_objects(self) -> tuple[Objects, Tensor]:
@@ -388,7 +393,7 @@ class Outcome(ABC):
         for place in self._confirmed_places:
             listing.confirm(place)
         objects, confirmed = listing.result()
-        if self.decision is not None and self._find is None:
+        if self.verdict in ("absent", "undecided"):
             # No closer look was as sure as the search asks for, so what it shows counts by its probability alone.
             objects = objects[~confirmed | (objects.scores >= self.score_threshold)]
             confirmed = torch.zeros(len(objects), dtype=torch.bool)

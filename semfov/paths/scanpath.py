@@ -165,8 +165,7 @@ class ScanpathWords(Words):
         name = f"“{record.target_name}”"
         if record.decision is None:
             return f"{name} {'found after' if record.found else 'not found in'} {shifts}"
-        is_absent = record.decision.outcome == "absent"
-        verdict = f"{name} {self.doubt}not there" if is_absent else self.verdict(name)
+        verdict = f"{name} {self.doubt}not there" if record.verdict == "absent" else self.verdict(name)
         return f"{verdict} after {shifts}{self._closer_looks} ({self._certainty(record.decision)})"
 
     @property

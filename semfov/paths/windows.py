@@ -259,8 +259,8 @@ def looks_at_windows(
 
 def _has_found(record: "ZoomPath") -> bool:
     """Tell whether the decision, or without one the objects say that a target was found."""
-    if record.decision is not None:
-        return record.decision.outcome == "found"
+    if record.verdict:
+        return record.verdict == "found"
     return bool(record.sought) and len(record.objects) > 0
 
 

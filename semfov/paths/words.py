@@ -132,19 +132,16 @@ class Words(ABC):
         Returns:
             A few words.
         """
-        decision = self.record.decision
-        assert decision is not None
-        if decision.outcome == "undecided" and not self._is_seen_clearly:
+        verdict = self.record.verdict
+        if verdict == "undecided" and not self._is_seen_clearly:
             return f"no {name} clearly seen: undecided"
-        return f"{name}{colon} {self.doubt}{decision.outcome}"
+        return f"{name}{colon} {self.doubt}{verdict}"
 
     @property
     def doubt(self) -> str:
         """The word `probably ` for a target that is absent, but not surely; otherwise empty."""
-        decision = self.record.decision
-        if decision is None or decision.outcome != "absent":
-            return ""
-        return "probably " if self.record.is_doubtful else ""
+        record = self.record
+        return "probably " if record.verdict == "absent" and record.is_doubtful else ""
 
     @property
     def _is_seen_clearly(self) -> bool:

@@ -188,9 +188,8 @@ def object_data(record: Record) -> Data:
 
 def _verdict(record: Record) -> str:
     """Tell how a search ended; without a decision something was found, or nothing, which is absent."""
-    if record.decision is not None:
-        return record.decision.outcome
-    return "found" if record.found or len(record.objects) else "absent"
+    has_find = record.found or len(record.objects) > 0
+    return record.verdict or ("found" if has_find else "absent")
 
 
 def _about_data(scanpath: Scanpath, settings: Settings | None) -> Data:
