@@ -1,9 +1,10 @@
 """Files of pictures in a folder: which of them are looked at, and warnings of those that are left out."""
 
 import warnings
-from collections.abc import Sequence, Set
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
+from semfov.data.classes import amount
 from semfov.errors import DataError, printable
 from semfov.io.files import MADE_HERE
 
@@ -18,6 +19,7 @@ VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 """Ends of the names of videos."""
 
 _HEAD = 4096  # bytes, in which the comment of a picture is
+_NAMED = 3  # largest number of files that a warning names
 
 
 def picture_files(source: Path, *, recursive: bool = False, frames: bool = False) -> list[Path]:
@@ -43,9 +45,12 @@ def picture_files(source: Path, *, recursive: bool = False, frames: bool = False
     files = sorted(path for path in visible if path.suffix.lower() in PHOTOGRAPHS)
     if recursive:
         files = _of_others(files, source)
-        _warn_of_links(source, [path for path in entries if path.is_symlink() and path.is_dir()])
+        # Folders behind links are not searched: they may lead back, or to another disk.
+        linked = [path for path in entries if path.is_symlink() and path.is_dir()]
+        _warn_of_omitted(source, linked, "folder", "behind symbolic links (looked at by name)")
     photographs(visible, str(source))  # warns of the other files
-    _warn_of_mosaics(source)
+    mosaics = [path for path in source.iterdir() if path.suffix.lower() == ".vrt"]
+    _warn_of_omitted(source, mosaics, "mosaic", "whose files are there, too (looked at by name)")
     if not files:
         raise DataError(_without_photographs(source, recursive=recursive, frames=frames))
     return files
@@ -65,39 +70,28 @@ def _visible_entries(folder: Path, *, recursive: bool) -> list[Path]:
     return [path for path in paths if not _is_hidden(path.relative_to(folder))]
 
 
-def _warn_of_links(source: Path, folders: Sequence[Path]) -> None:
-    """Warn of folders behind symbolic links, which are not searched: they may lead back, or to another disk."""
-    if not folders:
-        return
-    name = printable(str(min(folders)))
-    text = f"{len(folders)} folders behind symbolic links, such as {name}, are left out; name them"
-    if len(folders) == 1:
-        text = f"1 folder behind a symbolic link, {name}, is left out; name it"
-    warnings.warn(f"{source}: {text}, to look there", stacklevel=3)
+def _warn_of_omitted(where: object, paths: Collection[Path], noun: str, why: str) -> None:
+    """Warn of files or folders that are left out, if there are any, with the names of a few.
+
+    Args:
+        where: they are.
+        paths: they.
+        noun: what each of them is.
+        why: they are left out, and what to do.
+    """
+    if paths:
+        names = printable(", ".join(map(str, sorted(paths)[:_NAMED])))
+        warnings.warn(f"{where}: {amount(len(paths), noun)} left out, {why}: {names}", stacklevel=3)
 
 
 def _is_hidden(path: Path) -> bool:
     return any(part.startswith(".") for part in path.parts)
 
 
-def _warn_of_mosaics(folder: Path) -> None:
-    """Warn of mosaics in a folder, which are left out."""
-    mosaics = [path.name for path in folder.iterdir() if path.suffix.lower() == ".vrt"]
-    if mosaics:
-        remedy = "as their files are there, too; name them to look at them"
-        warnings.warn(f"{folder}: {len(mosaics)} mosaics, such as {mosaics[0]!a}, are left out, {remedy}", stacklevel=3)
-
-
 def _of_others(files: Sequence[Path], source: Path) -> list[Path]:
     """Drop the figures and crops that semfov has written, with a warning."""
     written = [path for path in files if _is_made_here(path)]
-    if written:
-        name = printable(str(written[0]))
-        pictures = f"{len(written)} pictures that semfov has written"
-        text = f"{pictures}, such as {name}, are left out; name them, or their folder"
-        if len(written) == 1:
-            text = f"1 picture that semfov has written, {name}, is left out; name it or its folder"
-        warnings.warn(f"{source}: {text}, to look there", stacklevel=3)
+    _warn_of_omitted(source, written, "picture", "written by semfov (looked at by name)")
     return [path for path in files if path not in written]
 
 
@@ -124,17 +118,8 @@ def photographs(paths: Sequence[Path], where: str) -> list[Path]:
     """
     kinds = {"", ".vrt", *PHOTOGRAPHS}
     foreign_files = {path for path in paths if path.suffix.lower() not in kinds and path.is_file()}
-    if foreign_files:
-        warnings.warn(f"{where}: {_without_foreign(foreign_files)}", stacklevel=3)
-    return [path for path in paths if path not in foreign_files]
-
-
-def _without_foreign(files: Set[Path]) -> str:
-    """Write that files are left out, as they are no photographs."""
-    name = printable(min(files).name)
-    text = f"{len(files)} files are no photographs and are left out, such as {name}"
-    if len(files) == 1:
-        text = f"1 file is no photograph and is left out, {name}"
     # `search`, `find` and `explore` take photographs alone.
-    has_videos = any(path.suffix.lower() in VIDEOS for path in files)
-    return f"{text}; `semfov live` takes videos" if has_videos else text
+    has_videos = any(path.suffix.lower() in VIDEOS for path in foreign_files)
+    remedy = " (`semfov live` takes videos)" if has_videos else ""
+    _warn_of_omitted(where, foreign_files, "file", f"of another kind than photographs{remedy}")
+    return [path for path in paths if path not in foreign_files]
