@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from os import PathLike
-from pathlib import Path
 from typing import Self, cast, get_args
 
 from torch import Tensor
@@ -16,7 +15,7 @@ from semfov.data.images import MAX_PIXELS, SMALLER
 from semfov.data.inputs import Color, ImageLike, as_image
 from semfov.data.large import open_large, picture_size
 from semfov.data.tone import White
-from semfov.data.windowed import BY_WINDOWS, ChosenBands, LargePicture
+from semfov.data.windowed import ChosenBands, LargePicture, has_windows
 from semfov.errors import InputError, SemfovError, check, lookup, type_of
 from semfov.eye import MOST_FLOATS
 from semfov.gaze.saliency.fixation_density import cells_of
@@ -208,7 +207,7 @@ class OpenedPicture:
     def _is_read_by_windows(self) -> bool:
         """Tell whether the pixels are read by windows, as those of a TIFF are."""
         if isinstance(self.source, str | PathLike):
-            return Path(self.source).suffix.lower() in BY_WINDOWS
+            return has_windows(self.source)
         return isinstance(self.source, LargePicture)
 
     @property
