@@ -6,7 +6,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
+from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
 from threading import Lock
@@ -492,10 +492,8 @@ def _over_white(image: "Image") -> "Image":
 class PhotographPicture(LargePicture):
     """A picture in a file that Pillow decodes as a whole, when the first window is read.
 
-    Private attribute: `_array` has the decoded bytes `(H, W, 3)`; None before.
-
-    Invariant: once it is there, `_array` is all that windows are read from, and it has the size that was found when the
-    file was opened; a file that is changed or removed afterwards changes nothing.
+    Invariant: once the picture is decoded, `_array` is all that windows are read from, and it has the size that was
+    found when the file was opened; a file that is changed or removed afterwards changes nothing.
     """
 
     path: Path
@@ -503,19 +501,17 @@ class PhotographPicture(LargePicture):
     def __init__(self, path: str | PathLike[str], white: White | None = None) -> None:
         self.path = Path(path)
         self._white = white
-        self._array: NDArray[np.uint8] | None = None
         with opening(self.path, "opened"), open_pillow(self.path) as image:
             check_proportion(image.size, self.path.stat().st_size, self.path)
             self.size = upright_size(image)
 
     def pixels(self, box: Box) -> NDArray[np.uint8]:
         x1, y1, x2, y2 = box
-        if self._array is None:
-            self._array = self._decoded_bytes()
         return self._array[y1:y2, x1:x2]
 
-    def _decoded_bytes(self) -> NDArray[np.uint8]:
-        """Decode the picture, without floats in between."""
+    @cached_property
+    def _array(self) -> NDArray[np.uint8]:
+        """The decoded bytes, `(H, W, 3)`, without floats in between."""
         name = f"image {self.path}"
         with opening(self.path, "decoded"), open_pillow(self.path) as image:
             if image.mode not in _PLAIN or self._white is not None or is_deep(image):

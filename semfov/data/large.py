@@ -70,8 +70,6 @@ def open_large(
         check(white is None and bands is None, "white", "None for a picture that is open; give it to open_large", white)
         return source
     if isinstance(source, str | PathLike):
-        if not has_windows(source):
-            check_no_bands(bands)
         return _open_file(source, white, bands)
     check_no_bands(bands)
     return ArrayPicture(_bytes_of(source, color, white))
@@ -85,6 +83,7 @@ def _open_file(path: str | PathLike[str], white: White | None, bands: ChosenBand
 
         picture: LargePicture = open_by_windows(path, white=white, bands=bands)
     else:
+        check_no_bands(bands)
         picture = PhotographPicture(path, white)
     if white is not None or bands is not None:
         # With which a record can open the file again; percentiles stay a word.
