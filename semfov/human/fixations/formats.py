@@ -2,10 +2,11 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ _BOX = Maybe(Array(_COORDINATE, 4))
 _SCREEN = 1680, 1050  # of COCO-Search18
 
 _Edges = tuple[float, float, float, float]
+_Stated = TypeVar("_Stated")
+_Converted = TypeVar("_Converted")
 
 _COCOSEARCH = Array(
     Object(
@@ -113,7 +116,7 @@ def read_cocosearch(
             size=_frame(name, trial, screen),
             durations=durations,
             target=trial.get("task"),
-            box=_edges_of(trial.get("bbox")),
+            box=_if_stated(_edges_of, trial.get("bbox")),
             found=_flag(f"{name}.fixOnTarget", trial.get("fixOnTarget")),
         )
         scanpaths.append(scanpath)
@@ -141,7 +144,7 @@ def write_cocosearch(path: str | PathLike[str], fixations: Sequence[Fixations]) 
             "name": scanpath.picture,
             "subject": scanpath.subject,
             "task": scanpath.target,
-            "bbox": _bbox_of(scanpath.box),
+            "bbox": _if_stated(_bbox_of, scanpath.box),
             "X": scanpath.points[:, 0].tolist(),
             "Y": scanpath.points[:, 1].tolist(),
             "length": len(scanpath),  # which programs for this data set read
@@ -268,7 +271,6 @@ def read_ruarte(
     for picture, trial in _read(path, _RUARTE).items():
         name = f"{path}: {picture}"
         points, durations = _points_and_durations(name, trial, ("X", "Y", "T"))
-        # In cells, the last row and column are inside the box, which ends where the next cell begins.
         is_in_cells = trial.get("receptive_width") == trial.get("receptive_height") == 1
         scanpath = Fixations(
             picture=picture,
@@ -277,7 +279,7 @@ def read_ruarte(
             size=(int(trial["image_width"]), int(trial["image_height"])),
             durations=durations,
             target=trial.get("target_object"),
-            box=_box_of_rows(trial.get("target_bbox"), is_in_cells),
+            box=_if_stated(partial(_box_of_rows, int(is_in_cells)), trial.get("target_bbox")),
             found=_flag(f"{name}.target_found", trial.get("target_found")),
         )
         scanpaths.append(scanpath if screen is None else scanpath.resized(screen))
@@ -317,7 +319,7 @@ def write_ruarte(path: str | PathLike[str], fixations: Sequence[Fixations]) -> N
             "Y": scanpath.points[:, 1].tolist(),
             "T": _milliseconds(scanpath),
             "target_object": scanpath.target,
-            "target_bbox": _rows_of_box(scanpath.box),
+            "target_bbox": _if_stated(_rows_of_box, scanpath.box),
             "target_found": scanpath.found,
         }
         trials[scanpath.picture] = _without_none(trial)
@@ -356,8 +358,8 @@ def _read(path: Path, kind: Json) -> Any:
 
 def _flag(name: str, value: object) -> bool | None:
     """Read a boolean of a file, or 1 or 0 in its place."""
-    check_data(value is None or value in (True, False), name, "true or false", repr(value))
-    return None if value is None else bool(value)
+    check_data(value in (None, True, False), name, "true or false", repr(value))
+    return _if_stated(bool, value)
 
 
 def _without_none(values: Mapping[str, object]) -> dict[str, object]:
@@ -370,34 +372,37 @@ def _milliseconds(scanpath: Fixations) -> list[float] | None:
     return None if scanpath.durations is None else scanpath.durations.tolist()
 
 
-def _edges_of(box: Sequence[float] | None) -> _Edges | None:
+def _if_stated(convert: Callable[[_Stated], _Converted], value: _Stated | None) -> _Converted | None:
+    """Convert a value that may be missing, None."""
+    return None if value is None else convert(value)
+
+
+def _edges_of(box: Sequence[float]) -> _Edges:
     """Find the edges x1, y1, x2 and y2 of a box `[x, y, width, height]`."""
-    if box is None:
-        return None
     x, y, width, height = box
     return float(x), float(y), float(x + width), float(y + height)
 
 
-def _bbox_of(box: _Edges | None) -> list[float] | None:
+def _bbox_of(box: _Edges) -> list[float]:
     """Write the edges of a box as `[x, y, width, height]`."""
-    if box is None:
-        return None
     x1, y1, x2, y2 = box
     return [x1, y1, x2 - x1, y2 - y1]
 
 
-def _box_of_rows(box: Sequence[float] | None, is_in_cells: bool) -> _Edges | None:
-    """Find the edges x1, y1, x2 and y2 of a box `[first row, first column, last row, last column]`."""
-    if box is None:
-        return None
+def _box_of_rows(side: int, box: Sequence[float]) -> _Edges:
+    """Find the edges x1, y1, x2 and y2 of a box `[first row, first column, last row, last column]`.
+
+    Args:
+        side: 1 where they are numbers of cells, since the last ones are inside the box, which ends where the next
+            cells begin; 0 in pixels.
+        box: the box.
+    """
     top, left, bottom, right = box
-    return float(left), float(top), float(right + is_in_cells), float(bottom + is_in_cells)
+    return float(left), float(top), float(right + side), float(bottom + side)
 
 
-def _rows_of_box(box: _Edges | None) -> list[float] | None:
+def _rows_of_box(box: _Edges) -> list[float]:
     """Write the edges of a box in pixels as `[first row, first column, last row, last column]`."""
-    if box is None:
-        return None
     x1, y1, x2, y2 = box
     return [y1, x1, y2, x2]
 
