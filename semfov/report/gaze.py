@@ -42,17 +42,19 @@ class ViewedArea(NamedTuple):
     visits: AreaVisits
 
 
-def viewed_areas(prediction: GazePrediction, areas: AreasLike, seconds: float) -> dict[str, ViewedArea]:
+def viewed_areas(prediction: GazePrediction, areas: AreasLike | None, seconds: float) -> dict[str, ViewedArea]:
     """Compute what is known of areas of interest.
 
     Args:
         prediction: the prediction for the picture.
-        areas: as for `GazePrediction.share`.
+        areas: as for `GazePrediction.share`; None for none.
         seconds: time for which each viewer views the picture.
 
     Returns:
         The areas by name.
     """
+    if areas is None:
+        return {}
     shares = prediction.share(areas)
     visits = prediction.visits(areas, seconds=seconds)
     boxes = prediction.areas(areas)
@@ -82,7 +84,7 @@ def gaze_part(
     steps = min(longest, _MOST_STEPS)
     densities = [prediction.cells]
     densities += [prediction.given(scanpaths, number) for number in range(1, steps + 1)]
-    viewed = {} if areas is None else viewed_areas(prediction, areas, seconds)
+    viewed = viewed_areas(prediction, areas, seconds)
     picture = {
         "name": prediction.name,
         "lead": _lead(prediction, viewed),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -120,7 +121,7 @@ def draw_legend(axes: Axes, entries: Sequence[LegendEntry]) -> None:
         text.set_parse_math(False)
 
 
-def object_marks(record: Record, last: int | None = None) -> list[Mark]:
+def object_marks(record: Record, last: float = math.inf) -> list[Mark]:
     """List the boxes of a record in the order in which they are drawn.
 
     First come places that a closer look refuted, then the objects, the most confident last, over the others, and then
@@ -128,13 +129,11 @@ def object_marks(record: Record, last: int | None = None) -> list[Mark]:
 
     Args:
         record: the record.
-        last: place of the last look that counts, from 0; None for all.
+        last: place of the last look that counts, from 0; infinity for all.
 
     Returns:
         The boxes, with labels for objects and for the best place.
     """
-    if last is None:
-        last = len(record)
     refuted = [look.box for look in record.refuted if look.index_of_look <= last]
     marks = [Mark(_corners(box), FOUND, ":", 1.6) for box in refuted]
     rows = [row for row in record.object_rows() if row["look"] - 1 <= last]
