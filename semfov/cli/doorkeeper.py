@@ -2,6 +2,7 @@
 
 import secrets
 import socket
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, MutableMapping
 from ipaddress import ip_address
 from typing import Any
@@ -38,7 +39,27 @@ def token_for(host: str) -> str | None:
     return None if is_here else secrets.token_urlsafe(16)
 
 
-class Doorkeeper:
+class Layer(ABC):
+    """Base of the layers of the server, which answer requests, or pass them on.
+
+    Args:
+        app: the server behind it.
+    """
+
+    def __init__(self, app: Application) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
+        """Answer a request; the messages with which the server itself begins and ends are no requests."""
+        answer = self._app if scope["type"] == "lifespan" else self.answer
+        await answer(scope, receive, send)
+
+    @abstractmethod
+    async def answer(self, scope: Message, receive: Receive, send: Send) -> None:
+        """Answer a request, or pass it on."""
+
+
+class Doorkeeper(Layer):
     """A layer of the server that answers requests of its own page alone, under an address that it was given.
 
     With a token, the first request has it in its address; the browser then keeps it in a cookie.
@@ -52,15 +73,11 @@ class Doorkeeper:
     # Another page in the same browser can send requests here, also under a name of its own for this address.
 
     def __init__(self, app: Application, host: str, token: str | None = None) -> None:
-        self._app = app
+        super().__init__(app)
         self._host = host
         self._token = token
 
-    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
-        # The messages with which the server itself begins and ends are no requests.
-        if scope["type"] == "lifespan":
-            await self._app(scope, receive, send)
-            return
+    async def answer(self, scope: Message, receive: Receive, send: Send) -> None:
         if not self.admits(header(scope, "host") or "", header(scope, "origin")):
             await refuse(scope, send, 403, _STRANGER)
         elif self._has_token(header(scope, "cookie") or "") or scope.get("path") == _BEGIN:

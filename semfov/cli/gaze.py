@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NotRequired, Self, TypedDict
+from typing import NotRequired, Self, TypedDict, cast
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from tqdm import tqdm
 from semfov.agents.picture import OpenedPicture
 from semfov.cli.agent import check_onnx_options, detector_options, remember
 from semfov.cli.options import DEFAULT_DETECTOR, GazeOptions
-from semfov.cli.results import held_outputs, tell_continuing, tell_written, unfinished
+from semfov.cli.results import FinishedWork, held_outputs, tell_continuing, tell_written, unfinished
 from semfov.cli.sources import example_source, picture_sources
 from semfov.data.examples import EXAMPLES
 from semfov.data.fixations import Fixations
@@ -31,7 +31,6 @@ from semfov.report.drafts import drafts_section
 from semfov.report.episode import Data
 from semfov.report.gaze import ViewedArea, gaze_page_html, gaze_part, viewed_areas
 from semfov.report.template import page_path, write_html
-from semfov.runs.results import SceneResults
 from semfov.viz.style import save_figure
 
 _DENSITIES = (".npy", ".tif", ".tiff", ".png")
@@ -113,7 +112,7 @@ class _GazeJob:
         report: the page that is written; None for none.
         areas: areas of interest; None for none.
         predictions: the predictions that are compared, by number.
-        finished: the outcomes that the same command takes up after an interruption; None where it keeps none.
+        finished: the outcomes that the same command takes up after an interruption.
     """
 
     def __init__(self, options: GazeOptions) -> None:
@@ -136,12 +135,12 @@ class _GazeJob:
             self.sources[0].tell_example()
         self.predictions: dict[int, GazePrediction] = {}
         self.outcomes: dict[int, _Outcome] = {}
-        self.finished: SceneResults | None = None
+        self.finished = FinishedWork()
         # A comparison needs both predictions whole, and what is kept of a picture is less.
         if self.several and not options.compare and self.outputs.table is not None:
             self.finished = self._take_up(self.outputs.table)
 
-    def _take_up(self, table: Path) -> SceneResults:
+    def _take_up(self, table: Path) -> FinishedWork:
         """Read what an interrupted command has predicted of the same pictures."""
         depends_on = {
             "options": self.options.result_settings(),
@@ -150,8 +149,8 @@ class _GazeJob:
             "areas": self.areas,
         }
         finished = unfinished(table, depends_on, self.sources)
-        for number, values in finished.items(len(self.sources)):
-            (outcome,) = values["records"]
+        for number, values in finished.outcomes():
+            outcome = cast(_Outcome, values)
             if "density" not in outcome or Path(outcome["density"]).exists():  # one that is gone is written again
                 self.outcomes[number] = outcome
         return finished
@@ -168,7 +167,7 @@ class _GazeJob:
             panorama=options.panorama,
         )  # fmt: skip
         paths = prediction.scanpaths(options.people, seconds=options.seconds, seed=options.seed)
-        areas = {} if self.areas is None else viewed_areas(prediction, self.areas, options.seconds)
+        areas = viewed_areas(prediction, self.areas, options.seconds)
         part = None if self.report is None else gaze_part(prediction, paths, self.areas, options.seconds)
         outcome: _Outcome = {
             "text": _text(source.name, prediction, paths, areas),
@@ -198,11 +197,6 @@ class _GazeJob:
             return save_figure(prediction.plot(areas=self.areas), path)
         return prediction.save_density(path)
 
-    def keep(self, number: int) -> None:
-        """Keep what was predicted of a picture for the same command, until all pictures are looked at."""
-        if self.finished is not None:
-            self.finished.save(number, [dict(self.outcomes[number])], {})
-
     def write(self, *, complete: bool) -> None:
         """Write scanpaths, table of pictures and page of the pictures so far, and list all files."""
         outcomes = dict(sorted(self.outcomes.items()))
@@ -213,8 +207,8 @@ class _GazeJob:
             *self._write_comparison(drafts),
             *self._write_page(outcomes, drafts),
         ]
-        progress = None if complete else f"{len(outcomes)} of {len(self.sources)}"
-        tell_written(written, self.finished, progress)
+        tell_written(written)
+        self.finished.end("" if complete else f"{len(outcomes)} of {len(self.sources)}")
 
     def _write_comparison(self, drafts: Drafts | None) -> list[Path]:
         """Say how two drafts differ, if there are two, and draw it if a figure is written."""
@@ -380,5 +374,5 @@ def _look_at_picture(job: _GazeJob, number: int) -> None:
         # Whatever fails at one picture, the others are looked at; `skip` raises what ends the command.
         job.sources[number].skip(error, several=job.several)
     else:
-        job.keep(number)
+        job.finished.keep(number, job.outcomes[number])
         tqdm.write(job.outcomes[number]["text"], file=sys.stdout)

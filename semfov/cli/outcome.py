@@ -15,7 +15,7 @@ from torch import Tensor
 from semfov.agents.picture import PictureLike
 from semfov.cli.formats import ResultsFormat
 from semfov.cli.options import ALL_DRAWINGS, PictureOptions
-from semfov.cli.results import kind_of, results_format
+from semfov.cli.results import STDOUT, kind_of, results_format
 from semfov.cli.sources import PictureSource
 from semfov.cli.truth import Truth
 from semfov.data.classes import amount
@@ -236,8 +236,8 @@ class PictureOutcome:
             # Records of other kinds of look have no more pixels than they keep.
             pixels = opened if record.kind.fine else None
             episode = record.page_data(pixels, name=Path(source.name).name, boxes=boxes)
-        out = options.results
-        form = None if out is None else results_format(out, truth=truth)
+        # Without a file of results a row is as in lines of JSON, to which nothing is added.
+        form = results_format(options.results or STDOUT, truth=truth)
         figures = _draw_episode(record, boxes, _drawings(options))
         return cls(
             ended=record.verdict or "looked at",
@@ -300,22 +300,21 @@ def _crops(record: Record, source: PictureSource, options: PictureOptions) -> di
     return files
 
 
-def _result_row(record: Record, source: PictureSource, seconds: float, form: ResultsFormat | None) -> Values:
+def _result_row(record: Record, source: PictureSource, seconds: float, form: ResultsFormat) -> Values:
     """Make the entry of a picture in a file of results.
 
     Args:
         record: the record of the picture.
         source: the picture.
         seconds: time that it took.
-        form: format of the file; None without a file.
+        form: format of the file.
 
     Returns:
         JSON values: the `picture`, and what the format adds.
     """
     values = {**record.to_dict(), "picture": source.name, "seconds": round(seconds, 3), "ended": record.words.ended}
     picture = {name: value for name, value in values.items() if name not in ("looks", "summary")}
-    added = {} if form is None else form.added(record, source.name, source.file)
-    return {"picture": picture, **added}
+    return {"picture": picture, **form.added(record, source.name, source.file)}
 
 
 def _draw_episode(record: Record, boxes: Tensor | None, drawings: Sequence[Drawing]) -> dict[str, bytes]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from time import time
 
-from semfov.cli.doorkeeper import Application, Message, Receive, Send, header, refuse
+from semfov.cli.doorkeeper import Application, Layer, Message, Receive, Send, header, refuse
 
 # Gradio has dozens of other addresses, which fetch pages for a visitor, run functions past the queue or tell the state
 # of the server. The page asks for none of them.
@@ -30,7 +30,7 @@ _LEAST_KEPT = 2**16  # bytes as which a file counts at least, so that their numb
 _MOST_DIGITS = 20  # of a size
 
 
-class RequestLimits:
+class RequestLimits(Layer):
     """A layer of the server that passes on what its own page asks for, and nothing else.
 
     A request names only files in the folder of uploads, as the server would open, or fetch, any other.
@@ -43,17 +43,13 @@ class RequestLimits:
     """
 
     def __init__(self, app: Application, folder: Path, most_bytes: int, seconds_kept: float) -> None:
-        self._app = app
+        super().__init__(app)
         self._folder = folder.resolve()
         self._most_bytes = most_bytes
         self._seconds_kept = seconds_kept
         self._arriving = 0  # bytes of the uploads that are under way
 
-    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
-        # The messages with which the server itself begins and ends are no requests.
-        if scope["type"] == "lifespan":
-            await self._app(scope, receive, send)
-            return
+    async def answer(self, scope: Message, receive: Receive, send: Send) -> None:
         refusal = self._refusal(scope)
         if refusal is None and scope["path"] in _CALLS:
             # The files that a call names are in its body, which is read here and replayed to the server.

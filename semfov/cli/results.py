@@ -4,7 +4,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
@@ -17,6 +17,7 @@ from semfov.data.classes import amount
 from semfov.errors import DataError, check, printable
 from semfov.io.code import package_digest
 from semfov.io.files import write_text, written_alone
+from semfov.paths.conversion import Values
 
 if TYPE_CHECKING:
     from semfov.runs.results import SceneResults
@@ -64,7 +65,21 @@ def results_format(path: Path, *, searched: bool = False, truth: Truth | None) -
     return FORMATS[kind_of(path) or ".json"](searched=searched)
 
 
-class ResultsFile:
+class Results:
+    """Results that are wanted in no file."""
+
+    def add(self, number: int, row: Row) -> None:
+        """Add a picture, or one that could not be read, with its `error`."""
+
+    def write(self) -> Sequence[Path]:
+        """Write the file, atomically; returns what was written."""
+        return ()
+
+    def print_judgement(self) -> None:
+        """Print how the objects agree with the annotations, where there are any."""
+
+
+class ResultsFile(Results):
     """A file of results that is complete for the pictures so far, whenever the command ends.
 
     `_rows` has the rows by the numbers of the pictures, which may come in any order. The file is not written again
@@ -86,12 +101,11 @@ class ResultsFile:
             write_text(path, "")
 
     def add(self, number: int, row: Row) -> None:
-        """Add a picture, or one that could not be read, with its `error`."""
         self._rows[number] = row
         if self.form.grows:
             self._append(self.form.text([row]))
         elif time.monotonic() >= self._due:
-            self.write()
+            self._write_whole()
 
     def _append(self, text: str) -> None:
         """Add text at the end of the stream or of the file."""
@@ -105,10 +119,13 @@ class ResultsFile:
         except OSError as error:
             raise DataError(f"cannot write {self.path}: {error.strerror or error}") from error
 
-    def write(self) -> None:
-        """Write the file, atomically."""
-        if self.form.grows:
-            return
+    def write(self) -> Sequence[Path]:
+        if not self.form.grows:
+            self._write_whole()
+        return () if self.path == STDOUT else (self.path,)
+
+    def _write_whole(self) -> None:
+        """Write all rows so far."""
         # The more pictures there are, the longer a file takes that is written anew, and the later it is due again.
         began = time.monotonic()
         write_text(self.path, self.form.text(self._in_order()))
@@ -116,7 +133,6 @@ class ResultsFile:
         self._due = began + took / _SHARE
 
     def print_judgement(self) -> None:
-        """Print how the objects agree with the annotations, where there are any."""
         judgement = self.form.judgement(self._in_order())
         if judgement is not None:
             print(judgement)
@@ -140,7 +156,47 @@ def held_outputs(options: object) -> AbstractContextManager[None]:
     return written_alone(files, folders)
 
 
-def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[PictureSource]) -> "SceneResults":
+class FinishedWork:
+    """What a command keeps of its pictures until all are looked at: nothing, where it cannot be continued."""
+
+    def outcomes(self) -> Iterator[tuple[int, Values]]:
+        """Yield what an interrupted command has kept of pictures, by their numbers."""
+        yield from ()
+
+    def keep(self, number: int, values: Mapping[str, object]) -> None:
+        """Keep what is known of a picture, as JSON values."""
+
+    def end(self, part: str) -> None:
+        """End the command, and say how it continues.
+
+        Args:
+            part: which part of the pictures is done, such as `2 of 3`; empty for all, of which nothing more is kept.
+        """
+
+
+class _KeptWork(FinishedWork):
+    """What is kept in a database beside the file of results of some pictures."""
+
+    def __init__(self, results: "SceneResults", pictures: int) -> None:
+        self._results = results
+        self._pictures = pictures
+
+    def outcomes(self) -> Iterator[tuple[int, Values]]:
+        for number, values in self._results.items(self._pictures):
+            yield number, values["records"][0]
+
+    def keep(self, number: int, values: Mapping[str, object]) -> None:
+        self._results.save(number, [dict(values)], {})
+
+    def end(self, part: str) -> None:
+        self._results.flush()
+        if part:
+            print(f"{part} pictures were looked at; the same command continues", file=sys.stderr)
+        else:
+            shutil.rmtree(self._results.path.parent, ignore_errors=True)
+
+
+def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[PictureSource]) -> FinishedWork:
     """Open what a command has finished of pictures that are the same, with all that it depends on.
 
     Args:
@@ -149,7 +205,7 @@ def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[P
         sources: the pictures.
 
     Returns:
-        The outcomes that were kept.
+        What was kept.
 
     Raises:
         DataError: another command was stopped, and what it has finished is kept there (`check_nothing_kept`).
@@ -164,7 +220,7 @@ def unfinished(file: Path, depends_on: Mapping[str, object], sources: Sequence[P
     # Where one picture is as before, others have changed since the same command was stopped.
     is_of_other_pictures = len(finished) > 0 and not finished.finished(len(sources))
     check_nothing_kept(file, None if is_of_other_pictures else finished.path)
-    return finished
+    return _KeptWork(finished, len(sources))
 
 
 def check_nothing_kept(file: Path, own: Path | None = None) -> None:
@@ -201,20 +257,7 @@ def tell_continuing(done: int, total: int) -> None:
         print(f"continuing: {done} of {total} pictures were looked at before")
 
 
-def tell_written(files: Sequence[object], finished: "SceneResults | None", part: str | None) -> None:
-    """List the files of a command, and say how it continues.
-
-    Args:
-        files: what was written.
-        finished: what is kept of it; removed where all is done.
-        part: which part of the pictures is done, such as `2 of 3`; None for all.
-    """
+def tell_written(files: Sequence[Path]) -> None:
+    """List the files that a command has written, if there are any."""
     if files:
         print("written:", *(f"  {printable(str(path))}" for path in files), sep="\n")
-    if finished is None:
-        return
-    finished.flush()
-    if part is None:
-        shutil.rmtree(finished.path.parent, ignore_errors=True)
-    else:
-        print(f"{part} pictures were looked at; the same command continues", file=sys.stderr)

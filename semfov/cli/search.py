@@ -202,19 +202,21 @@ def _look_and_write(job: PictureJob[PictureOptions], stream: TextIO) -> list[Val
         job.sources[0].tell_example()
     print(note_of_detector(job.options), end="")
     files = PictureFiles(job, stream)
-    before = files.finished_before()
+    before = files.take_up()
     tell_continuing(len(before), len(job.sources))
-    endings = Counter[str]()
+    numbers = [number for number in range(len(job.sources)) if number not in before]
+    endings = Counter(before.values())
     faults = list[SemfovError]()
     complete = False
     try:
-        for number, outcome in _outcomes(job, before):
+        for number, outcome in _outcomes(job, numbers):
             written = files.write_figures(number, outcome)
             if isinstance(written, SemfovError):
                 _skip(job, files, number, written)
                 faults.append(written)
             else:
-                _add(files, number, written, before=number in before)
+                files.add(number, written)
+                tqdm.write(written.text, file=sys.stdout)
                 endings[written.ended] += 1
         complete = True
     finally:
@@ -226,13 +228,6 @@ def _look_and_write(job: PictureJob[PictureOptions], stream: TextIO) -> list[Val
     if job.several:
         print(_totals(files, endings, len(faults)), end="")
     return [files.rows[number] for number in range(len(job.sources))]
-
-
-def _add(files: PictureFiles, number: int, outcome: PictureOutcome, *, before: bool) -> None:
-    """Add the outcome of a picture to the files, and print it, unless an earlier command did `before`."""
-    files.add(number, outcome, before=before)
-    if not before:
-        tqdm.write(outcome.text, file=sys.stdout)
 
 
 def _totals(files: PictureFiles, endings: Counter[str], skipped: int) -> str:
@@ -268,15 +263,13 @@ def _skip(job: PictureJob[PictureOptions], files: PictureFiles, number: int, fau
 
 
 def _outcomes(
-    job: PictureJob[PictureOptions], before: Mapping[int, PictureOutcome]
+    job: PictureJob[PictureOptions], numbers: list[int]
 ) -> Iterator[tuple[int, PictureOutcome | SemfovError]]:
-    """Yield the outcomes of all pictures with their numbers: those of before, then the others as they are made."""
-    yield from before.items()
+    """Yield the outcomes of pictures of some numbers, with these, as they are made."""
     if not job.several:
         yield 0, job.outcome(0)
         return
     options = job.options
-    numbers = [number for number in range(len(job.sources)) if number not in before]
     where: Where = options.workers if options.scheduler is None else options.scheduler
     if options.scheduler is None and options.workers != 1:
         # A process takes as long to start as this one has taken so far. The first picture that can be looked at tells

@@ -8,6 +8,8 @@ from semfov.cli.options import PictureOptions
 from semfov.cli.outcome import PictureOutcome
 from semfov.cli.results import (
     STDOUT,
+    FinishedWork,
+    Results,
     ResultsFile,
     check_nothing_kept,
     kind_of,
@@ -23,7 +25,6 @@ from semfov.paths.conversion import Values
 
 if TYPE_CHECKING:
     from semfov.report.episode import Data
-    from semfov.runs.results import SceneResults
 
 _KEPT = ("ended", "text", "row", "episode", "names")
 """Attributes of an outcome from which it is made again, without its files."""
@@ -34,10 +35,10 @@ class PictureFiles:
 
     Attributes:
         rows: the rows of the pictures so far, by number; those that were left out have an `error`.
-        finished: the outcomes that the same command takes up after an interruption; None for one picture.
+        finished: the outcomes that the same command takes up after an interruption.
 
-    Private attributes: `_results` is the file of results, and `_folder` that of the figures beside it; None without
-    one. `_written` has the figures so far, and `_episodes` the parts of the page by the numbers of their pictures.
+    Private attributes: `_results` is the file of results, and `_folder` that of the figures beside it. `_written` has
+    the figures so far, and `_episodes` the parts of the page by the numbers of their pictures.
 
     Invariant: each picture is added or skipped once, in any order; `finish` can be called after any of them.
     """
@@ -45,11 +46,11 @@ class PictureFiles:
     def __init__(self, job: PictureJob[PictureOptions], stream: TextIO) -> None:
         self.job = job
         self.rows: dict[int, Values] = {}
-        self.finished: SceneResults | None = None
+        self.finished = FinishedWork()
         self._written = list[Path]()
         self._episodes: dict[int, Data] = {}
-        self._results: ResultsFile | None = None
-        self._folder: Path | None = None
+        self._results = Results()
+        self._folder = Path()
         if job.options.figure is not None:
             self._written = [job.options.figure]
         if job.options.results is not None:
@@ -75,19 +76,25 @@ class PictureFiles:
             check_nothing_kept(file)
         self._results = ResultsFile(file, form, stream)
 
-    def finished_before(self) -> dict[int, PictureOutcome]:
-        """Read the outcomes of an interrupted command with the same options and models, by number."""
-        if self.finished is None:
-            return {}
-        stored = self.finished.items(len(self.job.sources))
-        return {number: PictureOutcome(**values["records"][0]) for number, values in stored}
+    def take_up(self) -> dict[int, str]:
+        """Add the pictures that an interrupted command with the same options and models has finished.
+
+        Returns:
+            How each of them ended, by number.
+        """
+        endings = {}
+        for number, values in self.finished.outcomes():
+            outcome = PictureOutcome(**values)
+            self._note(number, outcome)
+            endings[number] = outcome.ended
+        return endings
 
     def write_figures(self, number: int, outcome: PictureOutcome | SemfovError) -> PictureOutcome | SemfovError:
         """Write the crops, the labels and the figures of a picture.
 
         Args:
             number: number of the picture.
-            outcome: its outcome. If an earlier command finished the picture, the files exist already.
+            outcome: its outcome.
 
         Returns:
             The outcome, or why the files cannot be written.
@@ -98,48 +105,39 @@ class PictureFiles:
         try:
             for path, content in outcome.files.items():
                 write_bytes(path, content)
-            if self._folder is not None:
-                self._write_into(self._folder_of(number, self._folder), outcome, source.file)
+            for name, content in outcome.figures.items():
+                figure = self._folder_of(number) / name
+                check_apart(figure, [source.file])
+                write_bytes(figure, content)
         except Exception as error:
             return source.fault(error, several=self.job.several)
         return outcome
 
-    def _folder_of(self, number: int, folder: Path) -> Path:
+    def _folder_of(self, number: int) -> Path:
         """Name the folder of a picture's figures: one of its own within that of several pictures."""
         if not self.job.several:
-            return folder
+            return self._folder
         name = plain_name(Path(self.job.sources[number].name).name)
-        return folder / f"{number:03d}-{name}"
+        return self._folder / f"{number:03d}-{name}"
 
-    def _write_into(self, folder: Path, outcome: PictureOutcome, picture: Path | None) -> None:
-        """Write the figures of a picture into a folder, but not over the picture itself."""
-        for file, content in outcome.figures.items():
-            check_apart(folder / file, [picture])
-            write_bytes(folder / file, content)
-        # An earlier command may have written them, of which the outcome keeps the names alone.
-        self._written += [folder / file for file in outcome.names]
+    def add(self, number: int, outcome: PictureOutcome) -> None:
+        """Write the row of a picture, and keep it for the same command."""
+        self._note(number, outcome)
+        self.finished.keep(number, {name: getattr(outcome, name) for name in _KEPT})
 
-    def add(self, number: int, outcome: PictureOutcome, *, before: bool) -> None:
-        """Write the row of a picture, and keep it for the same command.
-
-        Args:
-            number: number of the picture.
-            outcome: its outcome.
-            before: whether an earlier command finished it, and has kept it.
-        """
+    def _note(self, number: int, outcome: PictureOutcome) -> None:
+        """Write the row of a picture, and note what is written of it."""
+        # An earlier command may have drawn its figures, of which the outcome keeps the names alone.
+        self._written += [self._folder_of(number) / name for name in outcome.names]
         self.rows[number] = outcome.row["picture"]
-        if self._results is not None:
-            self._results.add(number, outcome.row)
+        self._results.add(number, outcome.row)
         if outcome.episode is not None:
             self._episodes[number] = outcome.episode
-        if self.finished is not None and not before:
-            self.finished.save(number, [{name: getattr(outcome, name) for name in _KEPT}], {})
 
     def skip(self, number: int, reason: str) -> None:
         """Note a picture that is left out, and the reason."""
         self.rows[number] = {"picture": self.job.sources[number].name, "error": reason}
-        if self._results is not None:
-            self._results.add(number, {"picture": self.rows[number]})
+        self._results.add(number, {"picture": self.rows[number]})
 
     def finish(self, *, complete: bool) -> None:
         """Write the results and the page of all pictures so far, and list what was written.
@@ -149,19 +147,12 @@ class PictureFiles:
         """
         options = self.job.options
         folders = [folder for folder in (options.crops, options.labels) if folder is not None]
-        written = [*self._write_results(complete=complete), *self._written, *self._write_page(), *folders]
-        part = None if complete else f"{len(self.rows)} of {len(self.job.sources)}"
-        tell_written(written, self.finished, part)
-
-    def _write_results(self, *, complete: bool) -> list[Path]:
-        """Write the file of results, if one is wanted, and print how complete ones agree with annotations."""
-        if self._results is None:
-            return []
-        self._results.write()
+        results = self._results.write()
         was_looked_at = any("error" not in row for row in self.rows.values())
         if complete and was_looked_at:
             self._results.print_judgement()
-        return [] if self._results.path == STDOUT else [self._results.path]
+        tell_written([*results, *self._written, *self._write_page(), *folders])
+        self.finished.end("" if complete else f"{len(self.rows)} of {len(self.job.sources)}")
 
     def _write_page(self) -> list[Path]:
         """Write the page of the pictures so far, if it is wanted and there are some."""
