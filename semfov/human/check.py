@@ -175,8 +175,8 @@ class _FileContent(NamedTuple):
     has_frames: bool = True
 
 
-class _Reading(NamedTuple):
-    """What files of fixations do not tell themselves.
+class _Reading:
+    """What files of fixations do not tell themselves, without their pictures.
 
     Attributes:
         options: as a command gives them.
@@ -184,28 +184,26 @@ class _Reading(NamedTuple):
         sizes: sizes of the pictures that the options name; None where they name none.
     """
 
-    options: CheckOptions
-    arguments: dict[str, Any]
-    sizes: _PictureSizes | None
+    def __init__(self, options: CheckOptions, sizes: _PictureSizes | None = None) -> None:
+        self.options = options
+        self.arguments = _reading_arguments(options)
+        self.sizes = sizes
 
-    @classmethod
-    def of(cls, options: CheckOptions, keep: Callable[[Path], bool] | None = None) -> "_Reading":
+    @staticmethod
+    def of(options: CheckOptions, keep: Callable[[Path], bool] | None = None) -> "_Reading":
         """Find the pictures that options name; `keep` tells which of a folder may be opened, None for all."""
-        sizes = None
         if options.picture is not None and _shows_pictures(Path(options.picture)):
-            sizes = _PictureSizes(Path(options.picture), keep)
-        return cls(options, _reading_arguments(options), sizes)
+            return _ReadingBesidePictures(options, _PictureSizes(Path(options.picture), keep))
+        return _Reading(options)
 
     def report(self, path: Path) -> FixationReport:
         """Read one file of fixations, and say what is suspicious."""
-        if self.sizes is not None:
-            self.sizes.damage.clear()  # what is said of a file is of its own pictures
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what the lines below say
             warnings.filterwarnings("always", message=".*(is not UTF-8|is not read)")  # which they do not say
             reader = reader_of(path, self.arguments.get("columns"))
             records, has_frames = self._content_of(reader, path)
-        lines = [*suspicions(records, self.sizes), *self._damage(), *self._suspicions_by_content(records)]
+        lines = [*suspicions(records, self.sizes), *self._suspicions_by_pictures(records)]
         usual_frames = ""
         data_set = DATA_SETS.get(reader)
         if data_set in _WITHOUT_FRAMES and "size" not in self.arguments:
@@ -214,51 +212,71 @@ class _Reading(NamedTuple):
             usual_frames = " (the pictures, as the file has no frame; if they were shown on a screen, give its --size)"
         return FixationReport(_content(records, usual_frames), lines, was_compared=self.sizes is not None)
 
-    def _damage(self) -> list[str]:
-        """Say why pictures cannot be opened, the first of them."""
-        if self.sizes is None:
-            return []
-        return damage_lines([*self.sizes.damage.values()])
+    def _suspicions_by_pictures(self, records: Sequence[Fixations]) -> list[str]:
+        """Say what is suspicious in fixations beside their pictures, and in these."""
+        return []
 
-    def _suspicions_by_content(self, records: Sequence[Fixations]) -> list[str]:
-        """Compare fixations with where people look in their pictures, if there are pictures."""
-        if self.sizes is None or self.options.rules_alone or not records:
-            return []
-        # Where points look like those of another frame or unit, that is said by the rules alone, in one way.
-        if other_frame_of(records) is not None:
-            return []
-        return suspicions_by_content(records, self.sizes.path, self.sizes, quiet=self.options.quiet)
-
-    def _content_of(self, reader: _Reader, path: Path) -> "_FileContent":
+    def _content_of(self, reader: _Reader, path: Path) -> _FileContent:
         """Read the records of a file; of one picture of several, those that were made in it."""
-        picture = self.arguments.get("picture")
-        if picture is None or self._names_pictures(reader):
+        # Tables are tried without it first: those of several pictures have a column of their names.
+        takes_name = reader is not read_table and "picture" in signature(reader).parameters
+        if "picture" not in self.arguments or takes_name:
             return self._in_frames(reader, path, self.arguments)
+        return self._of_picture(reader, path)
+
+    def _of_picture(self, reader: _Reader, path: Path) -> _FileContent:
+        """Read the records of a file that were made in the picture that the options name."""
         without_picture = {name: value for name, value in self.arguments.items() if name != "picture"}
         try:
             content = self._in_frames(reader, path, without_picture)
         except PictureError:
             # The file names no picture, so this is the one.
             return self._in_frames(reader, path, self.arguments)
-        if self.sizes is None:
-            raise InputError(f"picture: expected a picture or folder that exists, got {picture}")
-        # A file with other names is compared as it is, and the report says that their pictures are not there.
-        in_picture = [record for record in content.records if record.picture in self.sizes]
-        return content._replace(records=in_picture or content.records)
+        return content._replace(records=self._in_picture(content.records))
 
-    def _names_pictures(self, reader: _Reader) -> bool:
-        """Tell whether `picture` is a name that the reader gives to fixations without one, and no file."""
-        # Tables are tried without it first: those of several pictures have a column of their names.
-        takes_name = reader is not read_table and "picture" in signature(reader).parameters
-        return takes_name and self.sizes is None
+    def _in_picture(self, records: list[Fixations]) -> list[Fixations]:
+        """Take the records that were made in the picture; raises `InputError` where there is none."""
+        picture = self.arguments["picture"]
+        raise InputError(f"picture: expected a picture or folder that exists, got {picture}")
 
-    def _in_frames(self, reader: _Reader, path: Path, arguments: dict[str, Any]) -> "_FileContent":
+    def _in_frames(self, reader: _Reader, path: Path, arguments: dict[str, Any]) -> _FileContent:
         """Read the records of a file; where it has no frames, they are the pictures."""
         try:
             return _FileContent(read_by(reader, path, arguments))
         except FrameError as error:
-            if self.sizes is None:
-                raise DataError(f"{error}, or give its pictures by --picture FOLDER") from None
+            raise DataError(f"{error}, or give its pictures by --picture FOLDER") from None
+
+
+class _ReadingBesidePictures(_Reading):
+    """What files of fixations do not tell themselves, with their pictures."""
+
+    sizes: _PictureSizes
+
+    def report(self, path: Path) -> FixationReport:
+        self.sizes.damage.clear()  # what is said of a file is of its own pictures
+        return super().report(path)
+
+    def _suspicions_by_pictures(self, records: Sequence[Fixations]) -> list[str]:
+        damage = damage_lines([*self.sizes.damage.values()])
+        # Where points look like those of another frame or unit, that is said by the rules alone, in one way.
+        if self.options.rules_alone or not records or other_frame_of(records) is not None:
+            return damage
+        by_content = suspicions_by_content(records, self.sizes.path, self.sizes, quiet=self.options.quiet)
+        return [*damage, *by_content]
+
+    def _content_of(self, reader: _Reader, path: Path) -> _FileContent:
+        if "picture" not in self.arguments:
+            return self._in_frames(reader, path, self.arguments)
+        return self._of_picture(reader, path)
+
+    def _in_picture(self, records: list[Fixations]) -> list[Fixations]:
+        # A file with other names is compared as it is, and the report says that their pictures are not there.
+        return [record for record in records if record.picture in self.sizes] or records
+
+    def _in_frames(self, reader: _Reader, path: Path, arguments: dict[str, Any]) -> _FileContent:
+        try:
+            return _FileContent(read_by(reader, path, arguments))
+        except FrameError:
             return _FileContent(_read_in_pictures(reader, path, arguments, self.sizes), has_frames=False)
 
 
