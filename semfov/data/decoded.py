@@ -53,8 +53,7 @@ class Decoded:
         limits = self._limits(white)
         for rows in self._parts():
             values = self.rows(rows)
-            is_shown = limits is None and values.dtype == np.uint8
-            pixels[rows] = values if is_shown else np.rint(self._shown(values, limits) * 255)
+            pixels[rows] = values if self._are_bytes(values, limits) else np.rint(self._shown(values, limits) * 255)
         return pixels
 
     def _parts(self) -> list[slice]:
@@ -66,25 +65,29 @@ class Decoded:
         """Leave out an alpha."""
         return values[..., :-1] if self.has_alpha else values
 
-    def _limits(self, white: White | None) -> tuple[float, float] | None:
-        """Choose the values that are black and white; None for 0 and the usual white."""
+    def _limits(self, white: White | None) -> tuple[float, float]:
+        """Choose the values that are black and white."""
         if white is None:
-            return None
+            return self._full_range
         # Percentiles are those of all values.
         seen = slice(0, self.shape[0]) if isinstance(white, str) else slice(0, 1)
         return black_and_white(white, self._shades(self.rows(seen)))
 
-    def _shown(self, values: Values, limits: tuple[float, float] | None) -> NDArray[np.float32]:
+    def _are_bytes(self, values: Values, limits: tuple[float, float]) -> bool:
+        """Tell whether values are bytes, of which 0 is black and the largest one is white."""
+        return values.dtype == np.uint8 and limits == self._full_range
+
+    def _shown(self, values: Values, limits: tuple[float, float]) -> NDArray[np.float32]:
         """Convert values to [0, 1], over white, `(h, W, 3)` or `(h, W, 1)`."""
         pixels = self._over_white(self._scaled(values, limits), values)
         return 1 - pixels if self.white_is_zero else pixels
 
-    def _scaled(self, values: Values, limits: tuple[float, float] | None) -> NDArray[np.float32]:
+    def _scaled(self, values: Values, limits: tuple[float, float]) -> NDArray[np.float32]:
         """Scale the colours to [0, 1], without the alpha."""
         shades = self._shades(values)
-        if limits is None and values.dtype == np.uint8:
+        if self._are_bytes(values, limits):
             return np.divide(shades, np.float32(self.most), dtype=np.float32)  # takes a tenth of the time
-        return between(shades, self._full_range if limits is None else limits)
+        return between(shades, limits)
 
     def _over_white(self, pixels: NDArray[np.float32], values: Values) -> NDArray[np.float32]:
         """Blend pixels in [0, 1] with white by the alpha in their values, or where these are transparent."""
