@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cache
+from importlib.util import resolve_name
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,13 +27,13 @@ class ImportStatement(NamedTuple):
 
     Attributes:
         names: what is imported.
-        module: the module that it is imported from; None where only dots name it, or nothing.
+        module: the module that it is imported from; empty where only dots name it, or nothing.
         level: number of dots of a relative import.
         is_from: whether it begins with `from`.
     """
 
     names: Sequence[str]
-    module: str | None = None
+    module: str = ""
     level: int = 0
     is_from: bool = False
 
@@ -48,17 +49,11 @@ class ImportStatement(NamedTuple):
         if not self.is_from:
             yield from self.names
             return
-        parts: list[str] = []
-        if self.level:
-            # One dot is the package itself, and each further one a parent.
-            parents = package.split(".")
-            parts = parents[: len(parents) - self.level + 1]
-        if self.module:
-            parts = [*parts, self.module]
-        base = ".".join(parts)
-        for name in self.names:
-            yield f"{base}.{name}"
-        yield base
+        with suppress(ImportError):  # of more dots than there are packages
+            base = resolve_name("." * self.level + self.module, package)
+            for name in self.names:
+                yield f"{base}.{name}"
+            yield base
 
 
 class Source(NamedTuple):
@@ -99,7 +94,7 @@ class _Spelling:
             self.imports.append(ImportStatement(names))
         elif isinstance(node, ast.ImportFrom):
             names = [alias.name for alias in node.names]
-            self.imports.append(ImportStatement(names, node.module, node.level, is_from=True))
+            self.imports.append(ImportStatement(names, node.module or "", node.level, is_from=True))
 
     def _spell_list(self, nodes: list[object]) -> None:
         """Append a list without its docstrings, after its length: else `[[a], b]` and `[[a, b]]` would read alike."""
