@@ -13,6 +13,7 @@ from semfov import read_image
 from semfov.data import windowed
 from semfov.data.large import open_large, picture_size
 from tests.data.test_large import pixels
+from tests.families import every_two
 from tests.refusals import unusable
 
 HIGH, WIDE = 150, 230
@@ -39,7 +40,7 @@ def shown(path, **given):
     return picture.pixels((0, 0, width, height)).astype(float), fovea
 
 
-@pytest.mark.parametrize(("bits", "layout", "photometric", "copies", "alpha"), VARIANTS)
+@pytest.mark.parametrize(("bits", "layout", "photometric", "copies", "alpha"), every_two(VARIANTS))
 def test_a_tiff_has_one_answer(tmp_path, bits, layout, photometric, copies, alpha):
     """Black and white, colours, an alpha that is multiplied already (1) or not (2), with reduced copies or without."""
     if copies:
@@ -77,10 +78,10 @@ def test_a_tiff_has_one_answer(tmp_path, bits, layout, photometric, copies, alph
     assert np.abs(fovea - want).max() <= 1.01
 
 
-@pytest.mark.parametrize("bits", [8, 16])
-@pytest.mark.parametrize("copies", [(), (2, 4)])
-@pytest.mark.parametrize("photometric", ["rgb", "minisblack", "miniswhite"])
-@pytest.mark.parametrize("hidden", ["mask", "value"])
+@pytest.mark.parametrize(
+    ("bits", "copies", "photometric", "hidden"),
+    every_two(itertools.product((8, 16), ((), (2, 4)), ("rgb", "minisblack", "miniswhite"), ("mask", "value"))),
+)
 def test_what_a_tiff_hides_has_one_answer(tmp_path, bits, copies, photometric, hidden):
     """A mask is white paper; a value without data is shown as it is, and `nothing` tells its colour."""
     rasterio = pytest.importorskip("rasterio", reason="needs rasterio (pip install semfov[geo])")
