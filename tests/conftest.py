@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, nullcontext
-from functools import partial
+from functools import cache, partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import SimpleNamespace
@@ -127,6 +127,16 @@ def pytest_runtest_protocol() -> Generator[None, object, object]:
         return (yield)
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def parsers() -> Iterator[None]:
+    """Make the parser of a command once for all tests that call it: a command of a user makes it once, too."""
+    from semfov.runs import command
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command, "make_parser", cache(command.make_parser))
+        yield
 
 
 @pytest.fixture(scope="module")
