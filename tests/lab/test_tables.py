@@ -18,6 +18,7 @@ from eval.explore import report as explore_report
 from eval.presence import hits_at
 from eval.search import report as search_report
 from semfov import EmbeddedScenes
+from semfov.metrics.calibration import calibration_error
 from semfov.metrics.episodes import area_under_roc
 from semfov.runs.tables import percent
 from tests.refusals import refused
@@ -195,8 +196,10 @@ def test_calibrated_probabilities_have_the_error_of_chance():
     """The mean and the limit of chance are those of outcomes that come true with their probabilities."""
     generator = torch.Generator().manual_seed(5)
     p = torch.rand(600, generator=generator, dtype=torch.float64)
-    drawn = [float(calibrated(p, torch.rand(600, generator=generator) < p)[0]) for _ in range(100)]
-    mean, limit = (float(part) for part in calibrated(p, p > 0.5)[1].split(", to "))
+    drawn = [float(calibration_error(p, torch.rand(600, generator=generator) < p)) for _ in range(100)]
+    measured, by_chance = calibrated(p, p > 0.5)
+    assert float(measured) == pytest.approx(float(calibration_error(p, p > 0.5)), abs=5e-4)
+    mean, limit = map(float, by_chance.split(", to "))
     assert mean == pytest.approx(sum(drawn) / 100, abs=0.003)
     assert 88 <= sum(error <= limit for error in drawn) <= 100
     assert float(calibrated(p.square(), torch.rand(600, generator=generator) < p)[0]) > limit
