@@ -151,6 +151,14 @@ def few_samples() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def few_viewers() -> Iterator[None]:
+    """Draw few viewers of a prediction; what many of them agree on is tested in `paths/test_gaze`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("semfov.paths.gaze._VIEWERS", 5)
+        yield
+
+
 FRESH = """
 import json, os, sys
 import semfov, torch

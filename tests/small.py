@@ -32,6 +32,12 @@ def rand(*shape: int) -> Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(sum(shape)))
 
 
+def slopes(width: int, height: int) -> Tensor:
+    """Bytes of a picture `(3, H, W)` whose colours rise across and down: of noise, figures are long to compress."""
+    across, down = torch.linspace(0, 255, width).expand(height, -1), torch.linspace(0, 255, height)[:, None]
+    return torch.stack([across, down.expand(-1, width), 255 - across]).byte()
+
+
 def draw(*shape: int, dtype: torch.dtype = torch.float64, device: torch.device | None = None, seed: int = 0) -> Tensor:
     """Uniform random numbers in [0, 1) of any precision, on any device."""
     generator = torch.Generator().manual_seed(seed + sum(shape))

@@ -18,7 +18,7 @@ from tests.small import Shown, rand
 
 
 @pytest.fixture
-def run(monkeypatch, tmp_path, capsys):
+def run(monkeypatch, tmp_path, capsys, few_viewers):
     """Runs the command with a model for `Shown`; returns code, output and errors."""
     detector = Shown("colours", ("cup",), (416, 416), stride=32, square=8).eval()
     torch.manual_seed(0)
@@ -27,7 +27,6 @@ def run(monkeypatch, tmp_path, capsys):
     model.save(tmp_path / "models/colours.safetensors")
     monkeypatch.setattr("semfov.cli.gaze.check_detector", lambda name: None)
     monkeypatch.setattr("semfov.cli.gaze.load_detector", lambda name, **options: detector)
-    monkeypatch.setattr("semfov.paths.gaze._VIEWERS", 5)  # what they agree on is tested with the prediction
 
     def call(*words):
         code = main(["gaze", *map(str, words)])
@@ -41,8 +40,8 @@ def photos(tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()
     for number, size in enumerate([(120, 90), (80, 100)]):
-        pixels = np.random.default_rng(number).integers(256, size=(size[1], size[0], 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"{number}.png")
+        colours = np.random.default_rng(number).integers(256, size=(6, 6, 3), dtype=np.uint8)
+        Image.fromarray(colours).resize(size).save(folder / f"{number}.png")  # figures of noise are slow to compress
     return folder
 
 

@@ -9,7 +9,9 @@ from semfov.paths.drafts import Drafts
 from semfov.report.drafts import drafts_section
 from semfov.viz.drafts import plot_difference
 from tests.refusals import refused
-from tests.small import rand
+from tests.small import slopes
+
+pytestmark = pytest.mark.usefixtures("few_viewers")
 
 LEFT, RIGHT = (0, 0, 52, 78), (52, 0, 104, 78)
 
@@ -22,7 +24,7 @@ def draft(name, right, size=(104, 78), cells=(39, 52), photograph=None):
     log[..., cells[1] // 2 :] += torch.tensor(right / (1 - right)).log()
     terms = {"map": log, "centre bias": torch.zeros(1, *cells)}
     if photograph is None:
-        photograph = (rand(3, size[1], size[0]) * 255).byte()
+        photograph = slopes(*size)
     return GazePrediction(model, terms, size, photograph, name)
 
 

@@ -28,7 +28,7 @@ from semfov.report.template import write_html
 from tests import small
 from tests.report.pages import Elements, data_of, loads_nothing, names_are_text
 from tests.report.test_browser import axe, chromium, playwright, pytestmark, watched  # noqa: F401
-from tests.small import rand
+from tests.small import rand, slopes
 
 
 @pytest.fixture
@@ -226,7 +226,7 @@ def predicted(name, size=(104, 78), seed=0):
     model = FixationDensity({"backbone8": 3}).eval().requires_grad_(False)
     model.oculomotor.saccade.normal_(0, 0.5)
     terms = {"map": 4 * torch.randn(1, 39, 52), "centre bias": -rand(1, 39, 52)}
-    return GazePrediction(model, terms, size, (rand(3, 78, 104) * 255).byte(), name)
+    return GazePrediction(model, terms, size, slopes(104, 78), name)
 
 
 def drawn(name, seed=0):
@@ -235,7 +235,7 @@ def drawn(name, seed=0):
 
 
 @pytest.fixture(scope="module")
-def gaze_page(hostile, tmp_path_factory):
+def gaze_page(hostile, few_viewers, tmp_path_factory):
     """The file of a page of two pictures."""
     pictures = [drawn(hostile), drawn("b.png", seed=1)]
     page = gaze_page_html(f"where people look in {hostile}", pictures)
@@ -320,6 +320,7 @@ def test_several_pictures_begin_with_an_overview_that_leads_to_each(opened, host
     assert sorted(rows.locator("a").all_inner_texts()) == sorted(names)
 
 
+@pytest.mark.usefixtures("few_viewers")
 def test_an_overview_has_shares_of_areas_and_cautions_where_there_are_some():
     prediction = predicted("a.png")
     viewers = prediction.scanpaths(2, seed=0)
@@ -336,6 +337,7 @@ def test_an_overview_has_shares_of_areas_and_cautions_where_there_are_some():
     assert 'id="overview"' not in gaze_page_html("compared", [without, without], "<section>both</section>")
 
 
+@pytest.mark.usefixtures("few_viewers")
 def test_names_of_areas_cover_none_of_them_and_stay_in_the_picture(chromium, tmp_path):  # noqa: F811
     """Only at the upper border, where there is no room above, is the name in its area."""
     name = "the button that leads to the shop"
@@ -357,6 +359,7 @@ def test_names_of_areas_cover_none_of_them_and_stay_in_the_picture(chromium, tmp
     assert labels[2]["y"] >= boxes[2]["y"] - 2
 
 
+@pytest.mark.usefixtures("few_viewers")
 def test_the_table_of_two_drafts_fits_a_telephone(chromium, tmp_path):  # noqa: F811
     drafts = Drafts(predicted("before-the-new-layout.png"), predicted("after-the-new-layout.png", seed=1))
     areas = {"the button that leads to the shop": (70, 50, 100, 60), "headline": (6, 12, 60, 20)}
