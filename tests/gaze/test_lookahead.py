@@ -230,7 +230,7 @@ def test_values_are_integrals_over_the_scores(name, calibrated):
             gain = measure(fusion.kaplan(beta, likelihood)) - measure(beta)
             return float(gain) * sum(float(p) * d for p, d in zip(mean, density, strict=True))
 
-        return quad(integrand, 0, 1, limit=200, epsabs=1e-4, epsrel=1e-4)[0]
+        return quad(integrand, 0, 1, limit=200, epsabs=1e-3, epsrel=1e-3)[0]
 
     model = two_classes()
     levels = model.level(ROW.cell_distance)
