@@ -37,11 +37,12 @@ from semfov.decision import MOST_CLOSER
 from semfov.detection.class_names import COCO_CLASSES
 from semfov.detection.detector import FAINT
 from semfov.detection.objects import FAINTEST, SCORE_THRESHOLD
+from semfov.fit.photographs import LEAST_CERTAINTY
 from semfov.head import Speeds
 from semfov.io.files import write_text
 from semfov.runs.config import BeliefConfig, DataConfig, DetectorConfig
 from semfov.sensor.log_polar import _Retina
-from semfov.zoom.closer import USUAL_WINDOW, PhotographPlaces
+from semfov.zoom.closer import USUAL_WINDOW
 
 ROOT = Path(__file__).parents[1]
 
@@ -81,8 +82,8 @@ CODE: dict[str, float] = {
     "score threshold of objects": SCORE_THRESHOLD,
     "faintest": FAINTEST,
     "likely": LIKELY,
-    "candidates of photographs": PhotographPlaces.least,
     "window of photographs": USUAL_WINDOW[0],
+    "least certainty of a closer look": LEAST_CERTAINTY,
     "opset": OPSET,
     "confirm of a head": _CONFIRM,
     "milliseconds of a saccade": 1000 * _SPEEDS.eye_start,

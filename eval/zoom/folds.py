@@ -44,11 +44,7 @@ def _settings(run: ZoomRun, photographs: int) -> FitMosaicsConfig:
     """Return the settings of a fit to so many photographs, with the closer looks of the shipped evidence."""
     settings = FitMosaicsConfig(photographs=photographs, seed=run.config.seed)
     shipped = run.evidence.photograph
-    if shipped is None:
-        return settings
-    settings = replace(settings, window=shipped.window)
-    thresholds = shipped.verification.thresholds
-    return settings if thresholds is None else replace(settings, stop_below=thresholds.stop_below)
+    return settings if shipped is None else replace(settings, window=shipped.window)
 
 
 def _chosen(scenes: Scenes, numbers: list[int]) -> ChosenScenes:

@@ -10,9 +10,10 @@ The numbers of a search, with one name each everywhere:
                  holds the target              closer looks                 that of its most probable cell by raw
                                                `PlaceVerifier.presence`;    scores, windows have none; a head has
                                                by windows `SearchFacts`     that of its most probable cell in both
-    place        probability that the target   `CloseUp.place`              with: by the verification, in a large
-                 is at one place, after a                                   picture by the certainty of the object
-                 closer look at it                                          there; without: no closer looks
+    place        probability that the target   `CloseUp.place`              with: a fovea by the verification,
+                 is at one place, after a                                   windows by the certainty of the object
+                 closer look at it                                          there, in a photograph fitted to places;
+                                                                            without: no closer looks
     hit_chance   chance that the best          `Belief.chance`; by windows  with: calibrated; without: it is not
                  remaining look shows the      `WindowStep.next_value`      asked for
                  target, if no look so far has
@@ -36,46 +37,37 @@ A `Decision` has two of them:
 What is compared with what, by the kind of look. With closer looks (`PlaceVerifier`) places decide, without them
 presence does (`settle`):
 
-    what                     fovea                       large picture               photograph by windows
-    -----------------------  --------------------------  --------------------------  ---------------------------
-    hit_chance < stop_below: of the best cell that was   of the best window that     of the best place that was
-    no look is worth a pass  not fixated                 was not looked at           not examined, times (1 - the
-                                                                                     largest place so far)
-    >= confirm, with         place of a closer look      as a fovea                  as a fovea
+    what                         fovea                                   windows
+    ---------------------------  --------------------------------------  -----------------------------------------------
+    hit_chance < stop_below: no  of the best cell that was not fixated   of the best window that was not looked at; in a
+    look is worth a pass                                                 photograph none is left after the whole
+    >= confirm, with closer      place of a closer look                  as a fovea
+    looks
+    >= confirm, without          presence, if a fixated cell is nearly   presence, if a detection shows the target
+                                 the most probable one
+    a closer look is due         at a cell from Thresholds.place on, if  at an object that is likely, from LIKELY on; at
+                                 a fixated cell is nearly the most       the last look from Thresholds.place on, in a
+                                 probable one, or at the last look       photograph from stop_below on
+    a closer look                tells of its place and of the picture   is one more look: place and presence are those
+                                 (`Verifier`)                            of all looks that count (`ObjectVerifier`)
+    a place ends the search at   if it is sure: from half-way between    as a fovea
+    once                         confirm and 1 on, after MOST_CLOSER
+                                 closer looks from confirm
+    the search is over           hit_chance < stop_below, or all closer  as a fovea; in a photograph at most
+                                 looks were made                         MOST_IN_PHOTOGRAPH
+    at a limit                   closer looks that are due are made      it ends as it is
+                                 with the passes that remain; it is over
+    compared by, with closer     `Verifier.outcome` of `CandidateCells`  `ObjectVerifier.outcome` of `ObjectPlaces`
+    looks
+    compared by, without         `decide`                                `settle`, called by `DecisionsByPresence`
     closer looks
-    >= confirm, without      presence, if a fixated      presence, if a detection    as a large picture
-                             cell is nearly the most     shows the target
-                             probable one
-    a closer look is due     at a cell from              at an object that is        where the hit chance of
-                             Thresholds.place on, if a   likely, from LIKELY on; at  that place >= stop_below
-                             fixated cell is nearly the  the last look from
-                             most probable one, or at    Thresholds.place on
-                             the last look
-    a closer look            tells of its place and of   is one more look: place     as a fovea, by windows
-                             the picture (`Verifier`)    and presence are those of   (`Verifier`)
-                                                         all looks that count
-                                                         (`ObjectVerifier`)
-    a place ends the search  if it is sure: from half-   as a fovea                  never: the next place may
-    at once                  way between confirm and 1                               be surer
-                             on, after MOST_CLOSER
-                             closer looks from confirm
-    the search is over       hit_chance < stop_below, or as a fovea                  as a fovea
-                             all closer looks were made
-    at a limit               closer looks that are due   it ends as it is            as a large picture
-                             are made with the passes
-                             that remain; it is over
-    compared by, with        `Verifier.outcome` of       `ObjectVerifier.outcome`    `Verifier.outcome` of
-    closer looks             `CandidateCells`            of `ObjectPlaces`           `PhotographPlaces`
-    compared by, without     `decide`                    `settle`, called by         as a large picture
-    closer looks                                         `DecisionsByPresence`
-    outcome, if over         found with a place, or presence, from confirm on; else absent if presence < 1/2, else
-                             undecided
-    outcome, if not over     found on the same terms, else undecided
-    ending of the record     "decision" if it is over or found; else the limit, or "cells" / "shifts" of a fovea and
-                             "windows" where none is left
+    outcome, if over             found with a place, or presence, from confirm on; else absent if presence < 1/2, else
+                                 undecided
+    outcome, if not over         found on the same terms, else undecided
+    ending of the record         "decision" if it is over or found; else the limit, or "cells" / "shifts" of a fovea and
+                                 "windows" where none is left
 
-Places of large pictures are in `semfov.zoom.places`, those of photographs in `semfov.zoom.closer`, and decisions by
-windows in `semfov.zoom.decision`.
+Places of windows are in `semfov.zoom.places`, and decisions by windows in `semfov.zoom.decision`.
 
 Without fitted models no probability decides: a detection whose score is at least `confirm` is `found` (ending
 "detection"), with a fovea if it covers the fixated cell well enough (`detects`, `confirms`); nothing is `absent`.

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cache, partial
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from semfov.decision.rule import CloseUp, cell_of, place_known
 from semfov.detection.detections import Detections
 from semfov.episode import Forgetting, Step
 from semfov.motion import CameraStep, LostScene, Motion
-from semfov.observation.matching import SAME_OBJECT_IOU, box_iou, inside_frame
+from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.observation.thresholds import Thresholds
 
 _COVERED = 0.5  # cells that an examined box covers with at least this weight are not examined again
@@ -58,20 +58,11 @@ class ExaminedPlace(NamedTuple):
     cells: Tensor
 
 
-class _CloserPlace(NamedTuple):
-    """The place `(4,)` of a closer look, its time, the probability of the target, and whether the frame shows it."""
-
-    time: float
-    box: Tensor
-    probability: float
-    in_view: bool = True
-
-
 class CandidatePlaces(ABC, Generic[LookType]):
     """Base of the places that seem to hold the target of one search, the most evident first, each listed once.
 
-    Invariant: after `see`, the numbers and the place that is `due` are those after the last look. In a stream, looks
-    and examined places of which less than half the evidence is left are forgotten (`wait`).
+    Invariant: after `see`, the numbers and the place that is `due` are those after the last look. In a stream, examined
+    places of which less than half the evidence is left are forgotten (`wait`).
 
     Attributes:
         detections: detections of the last look, a batch of one.
@@ -81,10 +72,6 @@ class CandidatePlaces(ABC, Generic[LookType]):
         grid: the cells, where places are cells.
         forgetting: how evidence fades in a stream.
     """
-
-    exhaustive = False
-    """Whether closer looks are made as long as one has enough chance of a hit, however sure the places so far are. Then
-    the best place alone tells what the picture holds."""
 
     detections: Detections
     target: int
@@ -100,12 +87,8 @@ class CandidatePlaces(ABC, Generic[LookType]):
         self.forgetting = Forgetting() if forgetting is None else forgetting
         self.prior = Prior() if prior is None else prior
         self._now = 0.0  # seconds of the stream
-        self._looks: list[tuple[float, Any]] = []  # time, and what a kind of places keeps of a look
         self._examined: list[ExaminedPlace] = []
-        self._places: list[_CloserPlace] = []  # of the closer looks
-        self._lost_looks: LostScene[tuple[float, Any]] = LostScene()
         self._lost_examined: LostScene[ExaminedPlace] = LostScene()
-        self._lost_places: LostScene[_CloserPlace] = LostScene()
 
     @abstractmethod
     def see(self, look: LookType) -> None:
@@ -148,10 +131,6 @@ class CandidatePlaces(ABC, Generic[LookType]):
         """
         return True
 
-    def shows_nothing_new(self, candidate: CandidatePlace) -> bool:
-        """Tell whether no look shows more of a candidate than the one behind the probability of the picture."""
-        return False
-
     def dismiss(self, candidate: CandidatePlace, box: Tensor) -> None:
         """Do not list a candidate again, nor others at its place; box `(4,)` of the target in the closer look."""
         boxes = torch.stack([candidate.box, box])
@@ -173,7 +152,6 @@ class CandidatePlaces(ABC, Generic[LookType]):
         Returns:
             The closer look, for the record of the search.
         """
-        self._places.append(_CloserPlace(self._now, box, place))
         return CloseUp(self._fixation, self.target, self.cell(box), box, place, presence, self._index)
 
     def examine(self, candidate: CandidatePlace, detections: Detections) -> tuple[Tensor, Tensor]:
@@ -192,29 +170,30 @@ class CandidatePlaces(ABC, Generic[LookType]):
             fitted(self.presence),
             fitted.at_place(candidate.probability, self.presence),
             candidate.evidence,
-            self.telling(candidate, detections),
+            detections,
             candidate.box,
             self.target,
         )
+        self.count_look(candidate)
         self.dismiss(candidate, box)
         return features, box
 
-    def telling(self, candidate: CandidatePlace, detections: Detections) -> Detections:
-        """Count the closer look, and choose which of its detections tell of the candidate."""
+    def count_look(self, candidate: CandidatePlace) -> None:
+        """Give the look that shows a candidate closely the next number of the search."""
         self._index = self._next
         self._next += 1
-        return detections
 
     def wait(self, passed: float = FRAME) -> None:
-        """Let seconds pass, and forget looks and examined places of which less than half the evidence is left."""
+        """Let seconds pass, and forget examined places of which less than half the evidence is left."""
         self._now += passed
-        oldest = self._now - self.forgetting.span
-        # With rate 0 none is too old, and their number would grow without end.
-        self._looks = [look for look in self._looks[-_MOST_LOOKS:] if look[0] >= oldest]
-        self._examined = [place for place in self._examined if place.time >= oldest]
-        self._places = [place for place in self._places if place.time >= oldest]
+        self._examined = [place for place in self._examined if place.time >= self._oldest]
 
-    def follow(self, camera: CameraStep, size: tuple[int, int]) -> None:
+    @property
+    def _oldest(self) -> float:
+        """Time before which less than half of the evidence is left."""
+        return self._now - self.forgetting.span
+
+    def follow(self, camera: CameraStep) -> None:
         """Carry examined places along with the camera.
 
         Those that are behind the camera now are forgotten. Where a frame fits none before, all are set aside, until the
@@ -222,10 +201,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
 
         Args:
             camera: how the camera moved.
-            size: `(width, height)` of the frames.
         """
-        self._looks = self._lost_looks.follow(self._looks, camera, lambda looks, _: looks)
-        self._places = self._lost_places.follow(self._places, camera, partial(_moved_places, size=size))
         self._examined = self._lost_examined.follow(self._examined, camera, _moved_examined)
 
     def cell(self, box: Tensor) -> int | None:
@@ -240,16 +216,6 @@ class CandidatePlaces(ABC, Generic[LookType]):
     @abstractmethod
     def probability(self, look: CloseUp) -> float:
         """Probability, without closer looks, that the target is at the place of a closer look; it fades towards it."""
-
-
-def _moved_places(places: list[_CloserPlace], motion: Motion, size: tuple[int, int]) -> list[_CloserPlace]:
-    """Move the places of closer looks with the camera, and note which of them the frame shows."""
-    if not places:
-        return []
-    boxes = motion.boxes(torch.stack([place.box for place in places]))
-    in_view = inside_frame(boxes, size).tolist()
-    moved = zip(places, boxes, in_view, strict=True)
-    return [place._replace(box=box, in_view=is_in_view) for place, box, is_in_view in moved]
 
 
 def _moved_examined(places: list[ExaminedPlace], motion: Motion) -> list[ExaminedPlace]:
@@ -285,6 +251,8 @@ class CandidateCells(CandidatePlaces[Step]):
         self.grid = grid
         self._target = target
         self._hit_chance = 1.0
+        self._looks: list[tuple[float, _LookAtCells]] = []  # each with its time
+        self._lost_looks: LostScene[tuple[float, _LookAtCells]] = LostScene()
 
     grid: Grid
     _step: Step
@@ -301,6 +269,17 @@ class CandidateCells(CandidatePlaces[Step]):
         self._looks.append((self._now, _LookAtCells(look.detections, footprint)))
         chance = look.belief.chance(self._target)
         self._hit_chance = float(chance.masked_fill(look.visited, 0).amax())
+
+    def wait(self, passed: float = FRAME) -> None:
+        """Let seconds pass, and forget looks and examined places of which less than half the evidence is left."""
+        super().wait(passed)
+        # With rate 0 none is too old, and their number would grow without end.
+        self._looks = [look for look in self._looks[-_MOST_LOOKS:] if look[0] >= self._oldest]
+
+    def follow(self, camera: CameraStep) -> None:
+        """Carry examined places along with the camera; looks come back with their scene."""
+        super().follow(camera)
+        self._looks = self._lost_looks.follow(self._looks, camera, lambda looks, _: looks)
 
     @property
     def hit_chance(self) -> float:

@@ -69,8 +69,7 @@ class PlaceVerifier(ABC, Generic[LookType]):
     It makes no look itself. After each look (`see`) it names the most evident place for a closer look (`candidate`), if
     it is probable enough; `examine` tells it what the closer look shows. The search ends at once with a place that is
     sure, after `MOST_CLOSER` closer looks with one from `confirm` on, and with the best one when it is over: when no
-    look is worth a pass, or `most` closer looks were made (the table in `semfov.decision`). Where all places are
-    examined (`CandidatePlaces.exhaustive`) none ends it at once, as the next may be surer.
+    look is worth a pass, or `most` closer looks were made (the table in `semfov.decision`).
 
     Closer looks may follow a look at once (`look_closely`), or take frames of their own in a stream. Their
     probabilities then fade towards the belief. With the rate r of the candidates' `Forgetting`, after a seconds
@@ -133,7 +132,7 @@ class PlaceVerifier(ABC, Generic[LookType]):
             size: `(width, height)` of the frames.
         """
         self._judged = None
-        self.places.follow(camera, size)
+        self.places.follow(camera)
         self.candidate = None if camera.motion is None else self._moved_candidate(camera.motion)
         self.verdicts = self._lost.follow(self.verdicts, camera, partial(_moved_verdicts, size=size))
 
@@ -269,8 +268,6 @@ class PlaceVerifier(ABC, Generic[LookType]):
 
     def _is_found_at_once(self, judged_places: Sequence[_JudgedPlace]) -> bool:
         """Whether one of the places ends the search, though it is not over."""
-        if self.places.exhaustive:
-            return False
         places = [judged.probability for judged in judged_places]
         return found_at_once(places, self.thresholds.confirm, len(self._recent))
 
@@ -361,10 +358,8 @@ class Verifier(PlaceVerifier[LookType]):
     @property
     def presence(self) -> float:
         without = self.places.presence
-        telling = self._recent
-        if self.places.exhaustive:  # the best place alone tells
-            telling = sorted(telling, key=_probability)[-1:]
-        faded = (self._faded(judged.verdict.look.presence, without, judged.verdict.age) for judged in telling)
+        looks = ((judged.verdict.look.presence, judged.verdict.age) for judged in self._recent)
+        faded = (self._faded(presence, without, age) for presence, age in looks)
         return max(faded, default=without)
 
     @torch.no_grad()
@@ -373,9 +368,7 @@ class Verifier(PlaceVerifier[LookType]):
         fitted_place, fitted_presence = self.model(features.to(self.model.linear.weight)).sigmoid().tolist()
         prior = self.places.prior
         place = prior.at_place(fitted_place, fitted_presence)
-        # The look that told of the picture before, such as the whole of a photograph, would count twice.
-        is_new = not self.places.shows_nothing_new(candidate)
-        return Judgement(place, prior(fitted_presence) if is_new else self.places.presence, box)
+        return Judgement(place, prior(fitted_presence), box)
 
 
 def _moved_verdicts(verdicts: list[_Verdict], motion: Motion, size: tuple[int, int]) -> list[_Verdict]:

@@ -1,19 +1,18 @@
 """Fit the evidence for photographs: whether one holds a class, before and after closer looks, and what an object is."""
 
 from collections.abc import Iterator, Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from semfov.belief.verification import Verification
 from semfov.data.scene import Annotation, Scenes
-from semfov.detection.detections import Detections
 from semfov.fit.logistic import logistic_regression
-from semfov.fit.searches import TargetSearch
-from semfov.fit.verification import OneKindError, fit_verification
-from semfov.fit.verification_report import NO_PLACES, verification_report
+from semfov.fit.verification import VerifiedSearch, choose_confirm
+from semfov.fit.verification_report import places_report
 from semfov.fit.windows_certainty import Exploration, fit_with_spread
+from semfov.fit.windows_decisions import search_to_end
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.observation.thresholds import Thresholds
 from semfov.runs.progress import track
@@ -21,7 +20,7 @@ from semfov.runs.protocols import choose_classes, numbers_drawn
 from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom import Lattice, WindowEye
 from semfov.zoom.certainty import Certainty
-from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, TargetFacts, look_closely
+from semfov.zoom.closer import MOST_IN_PHOTOGRAPH
 from semfov.zoom.evidence import GlimpseEvidence, PhotographEvidence
 from semfov.zoom.looks import Window, WindowLook, WindowLooks
 from semfov.zoom.slices import usual_slices
@@ -36,64 +35,73 @@ _ABSENT = 20
 _NEAR = 5.0  # strength with which the shares of searches stay near those that the frequencies predict
 _FALSE_ALARMS = 0.007  # maximum share of absent targets that may be reported as found; it determines the threshold
 
+LEAST_CERTAINTY = 0.02
+"""Least certainty of an object that is worth a closer look (docs/decisions/closer_looks.md)."""
+
+_STRENGTH = 20.0
+"""Strength with which a place stays the more probable the surer the object is that is there, also if few are known."""
+
 _AREA = 0.2  # classes that cover a larger share of a photograph are not searched for
 
 
-class _WholeSearch(TargetSearch[TargetFacts]):
-    """A search of a photograph after the look at the whole.
+class _PhotographSearch:
+    """A search of a photograph, with all closer looks that its objects are worth.
 
     Attributes:
+        picture: number of the photograph among those of the fit.
+        target: the class, 1..K.
+        spare: whether the search serves only to choose thresholds.
         source: the looks at the photograph.
-        whole: the look at the whole.
         objects: `(M, 4)`, annotated boxes of the class.
-        evidence: tells the probability of the class after the look.
-        best: highest score of the class.
+        best: after each look the highest score of the class so far.
+        places: certainty of the object at each place that was looked at closely, and whether the target is there.
+        ends: number of looks up to each of these closer looks.
     """
 
-    after = (1,)
-    most = MOST_IN_PHOTOGRAPH
-
-    def __init__(
-        self,
-        number: int,
-        target: int,
-        source: WindowLooks,
-        whole: WindowLook,
-        objects: Tensor,
-        evidence: PhotographEvidence,
-        *,
-        spare: bool = False,
-    ) -> None:
-        self.picture = number
+    def __init__(self, picture: int, target: int, source: WindowLooks, objects: Tensor, *, spare: bool = False) -> None:
+        self.picture = picture
         self.target = target
-        self.present = len(objects) > 0
         self.spare = spare
         self.source = source
-        self.whole = whole
         self.objects = objects
-        self.evidence = evidence
-        self.best = float(whole.show[target - 1])
+        self.best: list[float] = []
+        self.places: tuple[tuple[float, bool], ...] = ()
+        self.ends: tuple[int, ...] = ()
 
-    def __len__(self) -> int:
-        return 1
+    @property
+    def present(self) -> bool:
+        """Whether the photograph holds the class."""
+        return len(self.objects) > 0
 
-    def look(self, index: int, number: int) -> TargetFacts:
-        """Return the look at the whole, with the probability after it."""
-        presence = self.evidence.presence(torch.tensor(self.best), torch.tensor(self.target)).sigmoid()
-        return TargetFacts(self.whole.candidates, number, float(presence), self.best, 0.0)
-
-    def candidates(self) -> PhotographPlaces:
-        places = PhotographPlaces(self.target, self.source.lattice, window=self.evidence.window)
-        places.keep_whole(0, self.whole.candidates)
-        return places
-
-    def close_up(self, box: Tensor) -> Detections:
-        return look_closely(self.source, box, self.evidence.window).candidates
+    def run(self, model: GlimpseEvidence) -> None:
+        """Search as an agent does; with a threshold `confirm` of 1 no place ends it."""
+        path = search_to_end(model, self.source, self.target, 1 + MOST_IN_PHOTOGRAPH)
+        scores = (float(look.shown.show[self.target - 1]) for look in path.looks)
+        self.best = list(accumulate(scores, max))
+        closer = [(look, look.index) for look in path.closer if look.index is not None]
+        self.places = tuple((look.place, self.right(look.box)) for look, _ in closer)
+        self.ends = tuple(index + 1 for _, index in closer)
 
     def right(self, box: Tensor) -> bool:
         """Tell whether the centre of a box `(4,)` lies in an annotated box of the class."""
         centre = (box[:2] + box[2:]) / 2
         return bool(((self.objects[:, :2] <= centre) & (centre <= self.objects[:, 2:])).all(-1).any())
+
+    def judged(self, evidence: PhotographEvidence) -> VerifiedSearch:
+        """Sum up the search, with the probabilities of evidence."""
+        presence = evidence.presence(torch.tensor(self.best[-1]), torch.tensor(self.target)).sigmoid()
+        certainties = torch.tensor([certainty for certainty, _ in self.places])
+        chances = evidence.at_place(certainties).sigmoid().tolist()
+        return VerifiedSearch(
+            picture=self.picture,
+            present=self.present,
+            spare=self.spare,
+            places=tuple((chance, right) for chance, (_, right) in zip(chances, self.places, strict=True)),
+            ends=self.ends,
+            presence=max([float(presence), *chances]),
+            looks=len(self.best),
+            unverified=None,
+        )
 
 
 class _PhotographLooks(NamedTuple):
@@ -106,17 +114,11 @@ class _PhotographLooks(NamedTuple):
     """
 
     scores: Tensor
-    searches: list[_WholeSearch]
+    searches: list[_PhotographSearch]
     explored: dict[str, list[Exploration]]
 
 
-def fit_photographs(
-    model: GlimpseEvidence,
-    pictures: Scenes,
-    eye: WindowEye,
-    config: FitMosaicsConfig,
-    prior: Verification | None = None,
-) -> str:
+def fit_photographs(model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, config: FitMosaicsConfig) -> str:
     """Fit the evidence for photographs on those with most pixels, in folds, and add it to a model.
 
     Args:
@@ -124,7 +126,6 @@ def fit_photographs(
         pictures: photographs; the frequencies of classes are those in all of them.
         eye: looks at windows.
         config: how many photographs are looked at, and the settings of closer looks.
-        prior: centre of the prior of the verification (None: a weak one around 0).
 
     Returns:
         The report in Markdown.
@@ -133,18 +134,26 @@ def fit_photographs(
     if not looked:
         return "None, since no photograph is shown at more than half its size by one look.\n"
     held = _classes_held(pictures, model.classes)
-    evidence = PhotographEvidence(model.classes, window=config.window).eval().requires_grad_(False)
+    # With `confirm` 1 all closer looks are made, so that any threshold can be applied to a search afterwards.
+    limits = Thresholds(1.0, LEAST_CERTAINTY, LEAST_CERTAINTY)
+    evidence = PhotographEvidence(model.classes, window=config.window, thresholds=limits).eval().requires_grad_(False)
     evidence.usual.copy_(_log_odds_held(held.sum(0), len(pictures)))
-    looks = _look_at(pictures, looked, eye, evidence, config)
+    model.photograph = evidence
+    looks = _look_at(pictures, looked, eye, config)
+    _search_in_folds(model, looks)
     certainty, report_on_spread = fit_with_spread(looks.explored, _fit_objects, _CHECKED)
     evidence.certainty = certainty.requires_grad_(False)
-    _fit_whole(evidence, looks.searches, held)
+    _fit_presence(evidence, looks.searches, held)
     drawn = shares_by_frequency(evidence.usual, pictures)
     evidence.shares = measured_shares(evidence, looks.scores, held[looked], drawn)
-    report = _fit_closer_looks(evidence, looks.searches, config, prior)
-    model.photograph = evidence
+    searches = _judged_in_folds(evidence, looks.searches)
+    _fit_places(evidence, looks.searches)
+    least = float(evidence.at_place(torch.tensor(LEAST_CERTAINTY)).sigmoid())
+    confirm = choose_confirm(searches, _FALSE_ALARMS, config.surest)
+    evidence.thresholds = Thresholds(confirm, least, least)
     model.metadata["photograph"] = {"photographs": len(looked), "frequencies": len(pictures)}
-    return "\n".join([report, *report_on_spread])
+    report = places_report(searches, confirm, f"{len(looked)} photographs")
+    return "\n".join([*report, *report_on_spread])
 
 
 def _single_look_photographs(pictures: Scenes, eye: WindowEye) -> list[int]:
@@ -164,47 +173,79 @@ def _classes_held(pictures: Scenes, classes: int) -> Tensor:
     return held
 
 
-def _look_at(
-    pictures: Scenes,
-    looked: Sequence[int],
-    eye: WindowEye,
-    evidence: PhotographEvidence,
-    config: FitMosaicsConfig,
-) -> _PhotographLooks:
+def _look_at(pictures: Scenes, looked: Sequence[int], eye: WindowEye, config: FitMosaicsConfig) -> _PhotographLooks:
     """Look at the whole of photographs and at all their slices, and draw searches of them."""
     scores: list[Tensor] = []
-    searches: list[_WholeSearch] = []
+    searches: list[_PhotographSearch] = []
     explored: dict[str, list[Exploration]] = {f"fold {fold + 1}": [] for fold in range(_FOLDS)}
     for number, index in enumerate(track(looked, "looking at photographs", "photograph")):
         annotation = pictures.annotation(index)
         source = StoredWindowLooks(eye, pictures, index, None)  # in memory alone: files of looks lack its hints
         with torch.inference_mode():
             looks = source.see([Window.overview(source.lattice), *usual_slices(source.lattice)])
-        overview = looks[0]
-        scores.append(overview.show)
+        scores.append(looks[0].show)
         counted = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed)
         # The same draw with more absent classes begins with the same ones.
         targets = choose_classes(pictures, index, annotation, _PRESENT, _AREA, config.seed, _ABSENT)
         for place, target in enumerate(targets):
             objects = annotation.boxes[annotation.labels == target]
-            spare = place >= len(counted)
-            searches.append(_WholeSearch(number, target, source, overview, objects, evidence, spare=spare))
+            searches.append(_PhotographSearch(number, target, source, objects, spare=place >= len(counted)))
         explored[f"fold {number % _FOLDS + 1}"] += _explored(looks, source.lattice, annotation)
     return _PhotographLooks(torch.stack(scores), searches, explored)
 
 
-def _fit_whole(evidence: PhotographEvidence, searches: Sequence[_WholeSearch], held: Tensor) -> None:
-    """Fit the probability of a class after the look at the whole, with its frequency in the other photographs."""
-    counted = [search for search in searches if not search.spare]
+@torch.inference_mode()
+def _search_in_folds(model: GlimpseEvidence, looks: _PhotographLooks) -> None:
+    """Make all searches, those of each fold with the certainty of objects that is fitted to the others."""
+    assert model.photograph is not None
+    certainties: list[Certainty] = []
+    for fold in looks.explored:
+        others = [exploration for other, group in looks.explored.items() if other != fold for exploration in group]
+        # Of a single photograph there are no others.
+        certainties.append(_fit_objects(others or looks.explored[fold]).requires_grad_(False))
+    for search in track(looks.searches, "searching photographs", "search"):
+        model.photograph.certainty = certainties[search.picture % _FOLDS]
+        search.run(model)
+
+
+def _fit_presence(evidence: PhotographEvidence, searches: Sequence[_PhotographSearch], held: Tensor) -> None:
+    """Fit the probability of a class after each look of a search, with its frequency in the other photographs."""
     totals = held.sum(0)
-    best = torch.tensor([search.best for search in counted], dtype=torch.float64)
-    present = torch.tensor([search.present for search in counted])
-    holding = torch.tensor([int(totals[search.target - 1]) for search in counted])
-    in_others = _log_odds_held(holding - present.long(), len(held) - 1)
-    # A photograph must not tell its own answer by the frequency, which is therefore that in the others.
-    offset, *weights = logistic_regression(torch.stack([best.logit(1e-4), in_others], -1), present)
+    best: list[float] = []
+    holding: list[int] = []
+    present: list[bool] = []
+    for search in searches:
+        if not search.spare:
+            looks = len(search.best)
+            best += search.best
+            # A photograph must not tell its own answer by the frequency, which is therefore that in the others.
+            holding += [int(totals[search.target - 1]) - search.present] * looks
+            present += [search.present] * looks
+    in_others = _log_odds_held(torch.tensor(holding), len(held) - 1)
+    facts = torch.stack([torch.tensor(best, dtype=torch.float64).logit(1e-4), in_others], -1)
+    offset, *weights = logistic_regression(facts, torch.tensor(present))
     evidence.whole.weight.copy_(torch.tensor([weights]))
     evidence.whole.bias.fill_(offset)
+
+
+def _fit_places(evidence: PhotographEvidence, searches: Sequence[_PhotographSearch]) -> None:
+    """Fit the probability of places that were looked at closely, near that of the objects there."""
+    places = [place for search in searches if not search.spare for place in search.places]
+    certainty = torch.tensor([certainty for certainty, _ in places], dtype=torch.float64)
+    right = torch.tensor([is_right for _, is_right in places])
+    near = torch.tensor([0.0, 1.0], dtype=torch.float64), torch.tensor([1.0, _STRENGTH], dtype=torch.float64)
+    offset, weight = logistic_regression(certainty.logit(1e-4)[:, None], right, prior=near)
+    evidence.place.weight.fill_(weight)
+    evidence.place.bias.fill_(offset)
+
+
+def _judged_in_folds(evidence: PhotographEvidence, searches: Sequence[_PhotographSearch]) -> list[VerifiedSearch]:
+    """Judge the places of searches by regressions that are fitted to the other folds."""
+    judged: list[VerifiedSearch] = []
+    for fold in range(_FOLDS):
+        _fit_places(evidence, [search for search in searches if search.picture % _FOLDS != fold])
+        judged += [search.judged(evidence) for search in searches if search.picture % _FOLDS == fold]
+    return judged
 
 
 def shares_by_frequency(usual: Tensor, pictures: Scenes) -> Tensor:
@@ -287,17 +328,3 @@ def _fit_objects(explored: Sequence[Exploration]) -> Certainty:
 def _log_odds_held(held: Tensor, count: int) -> Tensor:
     """Compute the log odds that a photograph holds each class, half a photograph for and against added."""
     return ((held + 0.5) / (count + 1)).double().logit()
-
-
-def _fit_closer_looks(
-    evidence: PhotographEvidence, searches: Sequence[_WholeSearch], config: FitMosaicsConfig, prior: Verification | None
-) -> str:
-    """Fit the probabilities after a closer look and choose the thresholds; the report in Markdown."""
-    limits = Thresholds(1.0, config.stop_below, config.stop_below)
-    try:
-        fitted = fit_verification(searches, searches, _FOLDS, limits, _FALSE_ALARMS, config.surest, prior)
-    except OneKindError:
-        return NO_PLACES
-    evidence.verification = fitted.model
-    pictures = f"{len({search.picture for search in searches})} photographs"
-    return verification_report(fitted, pictures).text

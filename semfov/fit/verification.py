@@ -39,7 +39,7 @@ class VerifiedSearch(NamedTuple):
         present: whether it holds the target.
         spare: whether the search serves only to choose thresholds.
         places: probability of each place that was looked at closely, and whether the target is there.
-        ends: number of looks up to each closer look, itself included; empty where no place ends a search.
+        ends: number of looks up to each closer look, itself included.
         presence: probability that the picture holds the target, at the end.
         looks: number of all looks.
         unverified: end of the search without closer looks; None where the belief alone does not decide.
@@ -291,7 +291,7 @@ def _verify_search(search: TargetSearch[LookType], model: Verification, limits: 
         present=search.present,
         spare=search.spare,
         places=tuple((look.place, search.right(look.box)) for look in verifier.looks),
-        ends=() if places.exhaustive else tuple(ends),
+        ends=tuple(ends),
         presence=verifier.final_decision().probability,
         looks=looks,
         unverified=search.unverified(),
@@ -376,12 +376,3 @@ def _near(linear: nn.Linear, row: int, mean: Tensor, scale: Tensor) -> tuple[Ten
     offset = linear.bias[row].detach().double() + weight @ mean
     centre = torch.cat([offset[None], weight * scale])
     return centre, torch.full_like(centre, 2 * _STRENGTH)
-
-
-def mean_of(models: Sequence[Verification]) -> Verification:
-    """Average the parameters of several models; the result has no thresholds."""
-    average = Verification()
-    with torch.no_grad():
-        for name, parameter in average.named_parameters():
-            parameter.copy_(torch.stack([model.get_parameter(name) for model in models]).mean(0))
-    return average.eval().requires_grad_(False)

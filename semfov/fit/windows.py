@@ -8,7 +8,6 @@ from typing import Literal, get_args
 
 import torch
 
-from semfov.belief.verification import Verification
 from semfov.data.mosaics import Mosaics
 from semfov.data.scene import ChosenScenes, Scenes
 from semfov.errors import DataError, check
@@ -141,14 +140,12 @@ class MosaicFit:
         self,
         parts: Collection[RefitPart] = get_args(RefitPart),
         model: GlimpseEvidence | None = None,
-        prior: Verification | None = None,
     ) -> tuple[GlimpseEvidence, list[str]]:
         """Fit evidence, or parts of it again.
 
         Args:
             parts: the parts to fit, beside the numbers of objects of a class where there is no model.
             model: evidence that was fitted before; it is changed.
-            prior: centre of the prior of the verification in photographs.
 
         Returns:
             The evidence, and lines of Markdown.
@@ -178,7 +175,7 @@ class MosaicFit:
             lines += self.fit_decisions(model, self.search(model))
         if "photograph" in parts and self.config.photographs:
             scenes = make_scenes(self.config.data, self.eye.detector.classes)
-            lines += ["Photographs:", "", fit_photographs(model, scenes, self.eye, self.config, prior)]
+            lines += ["Photographs:", "", fit_photographs(model, scenes, self.eye, self.config)]
         return model, lines
 
     def looked(self, parts: Collection[RefitPart], anew: bool) -> list[str]:

@@ -19,12 +19,14 @@ from semfov.metrics.calibration import BinarySums
 from semfov.metrics.episodes import area_under_roc
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.observation.thresholds import Thresholds
+from semfov.paths import ZoomPath
 from semfov.runs.progress import track
 from semfov.runs.protocols import choose_classes
 from semfov.runs.tables import table
 from semfov.runs.zoom_store import StoredWindowLooks
 from semfov.zoom.episode import look_for
 from semfov.zoom.evidence import GlimpseEvidence
+from semfov.zoom.looks import WindowLooks
 from semfov.zoom.places import SearchFacts
 
 _JUDGED = (1, 4, 8, 16)  # numbers of looks after which the probability of presence is evaluated
@@ -78,9 +80,7 @@ class MosaicSearch:
 
     def verified(self) -> VerifiedSearch:
         """Search again as an agent does, with its closer looks; a threshold `confirm` of 1 lets it make all of them."""
-        names = tuple(map(str, range(self.model.classes + 1)))
-        task = WindowTask(Goal.of(names, self.target), self.model)
-        path = WindowEpisode(task, self.source, EpisodeLimits(self.passes)).run()
+        path = search_to_end(self.model, self.source, self.target, self.passes)
         assert path.decision is not None
         closer = [(look, look.index) for look in path.closer if look.index is not None]
         return VerifiedSearch(
@@ -97,6 +97,23 @@ class MosaicSearch:
     def right(self, box: Tensor) -> bool:
         """Tell whether a box `(4,)` is that of an annotated object of the class."""
         return self.present and float(box_iou(box[None], self.objects).max()) >= SAME_OBJECT_IOU
+
+
+def search_to_end(model: GlimpseEvidence, source: WindowLooks, target: int, passes: int) -> ZoomPath:
+    """Search a picture as an agent does.
+
+    Args:
+        model: evidence by magnification, with the thresholds of the search.
+        source: the looks at the picture.
+        target: the class, 1..K.
+        passes: largest number of looks.
+
+    Returns:
+        The record.
+    """
+    names = tuple(map(str, range(model.classes + 1)))
+    task = WindowTask(Goal.of(names, target), model)
+    return WindowEpisode(task, source, EpisodeLimits(passes)).run()
 
 
 @torch.inference_mode()

@@ -10,7 +10,6 @@ import torch
 from semfov.data.mosaics import Mosaics
 from semfov.fit.detector_report import Difference, curves_table, mean_percent, section
 from semfov.fit.part import PartFit, PartInputs, PartResult
-from semfov.fit.verification import mean_of
 from semfov.fit.windows import MosaicFit
 from semfov.fit.windows_settings import FitMosaicsConfig
 from semfov.metrics.episodes import FloatArray
@@ -92,7 +91,7 @@ class WindowsFit(PartFit):
             return self.left_out(self.settings["left out"])
         with one_thread():
             fit = MosaicFit(self.settings, WindowEye(self.run.eye.detector).eval().requires_grad_(False))
-            model, report = _fit_mosaics(fit)
+            model, lines = fit.fit()
             mosaics = fit.mosaics["judged"]
             opened = fit.opened("judged")
             curves = {
@@ -101,7 +100,7 @@ class WindowsFit(PartFit):
             }
         gain, why = _compare(curves)
         part = self.write("windows", model, gain.better, why)
-        return PartResult(part, "\n".join([_report_on_curves(curves, mosaics), report]))
+        return PartResult(part, "\n".join([_report_on_curves(curves, mosaics), *lines]))
 
 
 def _tasks(config: FitMosaicsConfig) -> dict[str, float]:
@@ -115,7 +114,8 @@ def _tasks(config: FitMosaicsConfig) -> dict[str, float]:
         "learning the survey": 0.4 * config.survey_steps,
         **{f"searching, {kind}": 4 * count for kind, count in searched.items()},
         "looking closely": 4 * config.judged,
-        "looking at photographs": 25 * _LOOK * config.photographs,
+        "looking at photographs": 5 * _LOOK * config.photographs,
+        "searching photographs": 20 * _LOOK * config.photographs,
         **{f"exploring, {kind}": 2 * count for kind, count in explored.items()},
     }
 
@@ -142,16 +142,6 @@ def _report_on_curves(curves: Mapping[str, FloatArray], mosaics: Mosaics) -> str
         "the order of the sums of the overview's raw scores, as the agent does without this part.",
         [[*row, mean] for row, mean in zip(rows, means, strict=True)],
     )
-
-
-def _fit_mosaics(fit: MosaicFit) -> tuple[GlimpseEvidence, str]:
-    """Fit all parts; closer looks at few photographs stay near the models shipped for other detectors."""
-    shipped = [
-        GlimpseEvidence.from_pretrained(file.stem) for file in sorted(GlimpseEvidence.shipped.glob("*.safetensors"))
-    ]
-    of_photographs = [other.photograph.verification for other in shipped if other.photograph is not None]
-    model, lines = fit.fit(prior=mean_of(of_photographs))
-    return model, "\n".join(lines)
 
 
 @torch.inference_mode()

@@ -34,7 +34,6 @@ class FitMosaicsConfig(FitConfig):
         place: least probability that the target is at a place, for a closer look there when no other look follows.
         photographs: number of photographs that are looked at by themselves, those with most pixels first, to fit the
             evidence for photographs; 0 leaves it out.
-        stop_below: chance of a new hit below which no closer look is made in a photograph.
         window: the window of a closer look in a photograph: its least side, in longer sides of the photograph, and its
             side in longer sides of the place.
         steps: number of training steps for the number of objects of a class.
@@ -57,7 +56,6 @@ class FitMosaicsConfig(FitConfig):
     lost: Share = 0.02
     place: Share = 0.2
     photographs: Whole = 320
-    stop_below: Share = 0.2
     window: tuple[Share, float] = USUAL_WINDOW
     steps: Count = 800
     survey_steps: Count = 1500

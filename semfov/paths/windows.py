@@ -12,7 +12,7 @@ from torch import Tensor
 from semfov.attribute_words import MOMENT
 from semfov.data.classes import amount, plural
 from semfov.detection import Objects
-from semfov.detection.objects import NO_TRACK
+from semfov.detection.objects import FAINTEST, NO_TRACK
 from semfov.errors import check
 from semfov.io.schema import Array, Field, Flag, Json, Maybe, Number, Object
 from semfov.kinds import WINDOWS
@@ -25,7 +25,6 @@ from semfov.paths.words import MomentWords, Words, number_with_error
 from semfov.tracking import Tracks
 from semfov.tracking.files import TRACK_FIELDS, track_tensors, tracks_of
 from semfov.zoom.certainty import SEVERAL, SPREAD, number_of, number_of_faint, reacts
-from semfov.zoom.closer import PhotographPlaces
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.objects import merge
@@ -117,7 +116,7 @@ class WindowWords(Words):
         if record.target is None or not is_photograph or not has_decided:
             return False
         chances = [float(look.show[record.target - 1]) for look in record.window_looks]
-        return all(chance < PhotographPlaces.least for chance in chances)
+        return all(chance < FAINTEST for chance in chances)
 
     @property
     def objects(self) -> str:

@@ -16,8 +16,6 @@ from semfov.decision import (
     CandidatePlace,
     CloseUp,
     Decision,
-    PlaceVerifier,
-    Verifier,
     settle,
 )
 from semfov.decision.rule import EVEN_CHANCE
@@ -29,11 +27,11 @@ from semfov.observation.presence import EVEN
 from semfov.observation.thresholds import Thresholds
 from semfov.settings import DecisionSettings
 from semfov.zoom.belief import ZoomBelief
-from semfov.zoom.closer import MOST_IN_PHOTOGRAPH, PhotographPlaces, TargetFacts, WindowPlaces
+from semfov.zoom.closer import MOST_IN_PHOTOGRAPH
 from semfov.zoom.episode import KeptLook, WindowStep
 from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.looks import WindowLook
-from semfov.zoom.places import ObjectPlaces, ObjectVerifier, SearchFacts
+from semfov.zoom.places import ObjectPlaces, ObjectVerifier, SearchFacts, TargetFacts
 
 CLOSER = 100  # largest number of closer looks in a large picture: as many as there are passes for
 _DEFAULTS = Thresholds(0.9, 0.005)  # thresholds of searches whose evidence has none
@@ -171,13 +169,12 @@ class DecisionsByPresence(WindowDecisions):
         self.prior = prior
         self.criterion = f"p is {thresholds.confirm:g} and a detection shows the target"
         self._facts = facts
-        self._is_large = facts.belief.photograph is None
         self._fitted_chance = 0.0  # chance of a hit after the last look, by the prior of the fit
-        self._step: WindowStep[ZoomBelief | None] | None = None  # the last one
+        self._has_looked = False
 
     def see(self, step: WindowStep[ZoomBelief | None], kept: Sequence[KeptLook], number: int, room: float) -> None:
-        self._step = step
-        self._facts.see(self._telling(step, kept))
+        self._has_looked = True
+        self._facts.see([look.current for look in kept])
         self._fitted_chance = step.next_value
         self.outcome = GO_ON
         if not self._goes_on():
@@ -186,13 +183,10 @@ class DecisionsByPresence(WindowDecisions):
         if self._facts.latest:
             self._absence.see(self._latest_decision)
 
-    def _telling(self, step: WindowStep[ZoomBelief | None], kept: Sequence[KeptLook]) -> list[WindowLook]:
-        """List the looks that tell of the picture; a closer look at a photograph tells of its place alone."""
-        return [look.current for look in kept] if self._is_large else step.looks
-
     def _goes_on(self) -> bool:
         """Whether the search goes on, whatever the presence is: nothing was found, and a look is worth a pass."""
-        if not self._is_large or self._facts.detected or self.looks:
+        # In a photograph no window is left after the whole, and its chance of a hit is 0.
+        if self._facts.detected or self.looks or self._fitted_chance == 0:
             return False
         return self._hit_chance() >= self.thresholds.stop_below
 
@@ -222,9 +216,8 @@ class DecisionsByPresence(WindowDecisions):
 
     def follow(self, camera: CameraStep, kept: Sequence[KeptLook]) -> None:
         self._absence.follow(camera, kept)
-        looks = [] if camera.motion is None or self._step is None else self._telling(self._step, kept)
-        if looks:
-            self._facts.see(looks)
+        if camera.motion is not None and self._has_looked and kept:
+            self._facts.see([look.current for look in kept])
 
     def _hit_chance(self) -> float:
         """Chance that the best remaining window shows the target."""
@@ -234,27 +227,24 @@ class DecisionsByPresence(WindowDecisions):
 
 
 class DecisionsByCloserLooks(DecisionsByPresence):
-    """Decisions of a search by closer looks at the places that seem to hold the target: by certainty, or verified."""
+    """Decisions of a search by closer looks at the objects that may be the target."""
 
-    def __init__(
-        self, facts: SearchFacts, prior: Prior, verifier: PlaceVerifier[TargetFacts], places: WindowPlaces
-    ) -> None:
-        super().__init__(facts, verifier.thresholds, prior, places.forgetting)
+    def __init__(self, facts: SearchFacts, verifier: ObjectVerifier) -> None:
+        self.places = verifier.places
+        super().__init__(facts, verifier.thresholds, self.places.prior, self.places.forgetting)
         self.frame = facts.belief.lattice.size
         self.verifier = verifier
-        self.places = places  # those of the verifier
         self.criterion = verifier.criterion
 
     def see(self, step: WindowStep[ZoomBelief | None], kept: Sequence[KeptLook], number: int, room: float) -> None:
         if step.look.window.is_overview:
-            self.places.keep_whole(number - 1, step.look.candidates)
+            self.places.keep_whole(number - 1, step.look.detections)
         super().see(step, kept, number, room)
 
     def _judge(self, step: WindowStep[ZoomBelief | None], number: int, *, last: bool) -> None:
         """Choose the place of the next closer look, and decide."""
-        candidates = step.look.candidates
-        presence = self._facts.presence()
-        look = TargetFacts(candidates, number, presence, self._facts.best, self._fitted_chance, step.look.window)
+        shown = step.look.detections
+        look = TargetFacts(shown, number, self._facts.presence(), self._fitted_chance, step.look.window)
         self.verifier.see(look, last=last)
         self._examine_shown()
 
@@ -267,9 +257,8 @@ class DecisionsByCloserLooks(DecisionsByPresence):
         return self.verifier.looks
 
     def examine(self, look: WindowLook, kept: Sequence[KeptLook]) -> None:
-        if self._is_large:
-            self._facts.see([of_picture.current for of_picture in kept])
-        self.verifier.examine(look.candidates)
+        self._facts.see([of_picture.current for of_picture in kept])
+        self.verifier.examine(look.detections)
         self._examine_shown()
         if self._facts.latest:
             self._absence.see(self._latest_decision)
@@ -309,7 +298,7 @@ def decisions_of(
 ) -> WindowDecisions:
     """Make the decisions of a search with evidence, by the kind of picture and the settings.
 
-    Evidence for large pictures has two sets of fitted thresholds, that for photographs one:
+    Evidence for large pictures has two sets of fitted thresholds. That for photographs has one, which serves as both:
 
         thresholds   of presence: its `stop_below` ends searches, and its `confirm` finds where no closer look is made
         places       of places after closer looks: its `confirm` finds. None for no closer looks
@@ -335,7 +324,7 @@ def decisions_of(
         of_places = belief.evidence.places
         most = CLOSER
     else:
-        fitted = of_places = photograph.verification.thresholds
+        fitted = of_places = photograph.thresholds
         most = MOST_IN_PHOTOGRAPH
     if settings.closer is not None:
         most = settings.closer
@@ -343,12 +332,10 @@ def decisions_of(
     if not most or of_places is None:
         return DecisionsByPresence(facts, thresholds.changed(settings.confirm), prior, forgetting)
     of_places = of_places.changed(settings.confirm, thresholds.stop_below)
-    if photograph is None:
-        objects = ObjectPlaces(facts, forgetting, prior)
-        return DecisionsByCloserLooks(facts, prior, ObjectVerifier(objects, of_places, most), objects)
-    places = PhotographPlaces(belief.target, belief.lattice, forgetting, prior, photograph.window)
-    verifier: Verifier[TargetFacts] = Verifier(photograph.verification, places, of_places, most)
-    return DecisionsByCloserLooks(facts, prior, verifier, places)
+    if photograph is not None:
+        # After the look at the whole only closer looks are left, each worth a pass by the probability of its place.
+        of_places = of_places.changed(place=thresholds.stop_below)
+    return DecisionsByCloserLooks(facts, ObjectVerifier(ObjectPlaces(facts, forgetting, prior), of_places, most))
 
 
 def _prior_of(prior: PriorLike, photograph: PhotographEvidence | None, target: int) -> Prior:

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.errors import check, check_number, check_whole
 from semfov.io.compatibility import Settings, check_same_detector
 from semfov.io.pretrained import Pretrained
@@ -36,18 +35,25 @@ _RATE = 14
 _RATE_WIDTH = 32
 
 
-class PhotographEvidence(nn.Module):
-    r"""Whether a photograph holds a class, by the highest score s of a hint and the share q of photographs.
+class PhotographEvidence(DecidingModule):
+    r"""Whether a photograph holds a class, by the highest score s of a hint and the share q of photographs, and where.
 
     .. math:: \operatorname{logit} P(t) = a \operatorname{logit} s + b \operatorname{logit} q_t + c
+
+    With the certainty p of an object (`Certainty`), which is right if its box is, a search finds its target there with
+
+    .. math:: \operatorname{logit} P(\text{place}) = a' \operatorname{logit} p + c'
+
+    since it looks for one object where others may be, and half of its targets are there.
 
     Attributes:
         usual: `(K,)`, logit q.
         shares: `(K,)`, by class the share of the searches of the fit whose target was there (`semfov.belief.prior`);
             None if not known.
-        whole: the logistic regression.
+        whole: the logistic regression of presence.
+        place: that of a place; before a fit the probability of a place is that of the object.
         window: size of the window of a closer look in a photograph (`semfov.zoom.closer.USUAL_WINDOW`).
-        verification: probabilities after a closer look in a photograph.
+        thresholds: thresholds of places after closer looks; None decides searches without them.
         certainty: probability that an object of a photograph is there; None where it was not fitted.
     """
 
@@ -68,7 +74,10 @@ class PhotographEvidence(nn.Module):
         self.register_buffer("usual", torch.zeros(classes))
         self.register_buffer("shares", shares)
         self.whole = nn.Linear(2, 1)
-        self.verification = Verification(thresholds=thresholds)
+        self.place = nn.Linear(1, 1)
+        nn.init.ones_(self.place.weight)
+        nn.init.zeros_(self.place.bias)
+        self.thresholds = thresholds
         self.certainty = certainty
 
     def presence(self, best: Tensor, target: Tensor) -> Tensor:
@@ -85,6 +94,19 @@ class PhotographEvidence(nn.Module):
         with without_autocast(facts):
             return self.whole(facts)[..., 0]
 
+    def at_place(self, certainty: Tensor) -> Tensor:
+        """Predict whether the target of a search is where an object is.
+
+        Args:
+            certainty: `(...)`, probabilities of objects.
+
+        Returns:
+            Log odds, `(...)`.
+        """
+        log_odds = certainty.logit(1e-4)[..., None].to(self.place.weight)
+        with without_autocast(log_odds):
+            return self.place(log_odds)[..., 0]
+
     @staticmethod
     def shapes() -> dict[str, tuple[int | str, ...]]:
         """Shapes of the tensors of a fitted one in the file of a model, by name."""
@@ -92,8 +114,8 @@ class PhotographEvidence(nn.Module):
             "usual": ("K",),
             "whole.weight": (1, 2),
             "whole.bias": (1,),
-            "verification.linear.weight": (2, CLOSER_FEATURES),
-            "verification.linear.bias": (2,),
+            "place.weight": (1, 1),
+            "place.bias": (1,),
         }
 
 
@@ -361,7 +383,7 @@ def _photograph_record(photograph: PhotographEvidence | None) -> dict[str, objec
     if photograph is None:
         return None
     return {
-        "thresholds": thresholds_record(photograph.verification.thresholds),
+        "thresholds": thresholds_record(photograph.thresholds),
         "certainty": _certainty_record(photograph.certainty),
         "window": list(photograph.window),
     }

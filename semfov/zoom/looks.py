@@ -3,11 +3,10 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from semfov.detection.detections import Detections
 from semfov.motion import CameraStep
@@ -125,14 +124,6 @@ class WindowLook:
     show: Tensor
     gist: Gist | None
     hints: Hints | None = None
-
-    @cached_property
-    def candidates(self) -> Detections:
-        """What it shows of places that may hold a target: its detections, in a photograph all its hints."""
-        if self.hints is None:
-            return self.detections
-        boxes, scores = self.hints
-        return Detections(boxes[None], F.pad(scores, (1, 0))[None], torch.ones(1, len(boxes), dtype=torch.bool))
 
 
 def half_steps(lattice: Lattice) -> Iterator[Window]:

@@ -1,5 +1,6 @@
-"""What the looks of a search show of the target, and its places in a large picture: the objects that they show."""
+"""What the looks of a search show of the target, and its places: the objects that they show."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -7,20 +8,24 @@ import torch
 from torch import Tensor
 
 from semfov.belief.prior import Prior
-from semfov.decision import CandidatePlace, CloseUp, Judgement, PlaceVerifier
+from semfov.data.inputs import FRAME
+from semfov.decision import CandidatePlace, CandidatePlaces, CloseUp, Judgement, PlaceVerifier
 from semfov.detection.detections import Detections
 from semfov.detection.objects import Objects
 from semfov.episode import Forgetting
+from semfov.motion import CameraStep
 from semfov.observation.matching import SAME_OBJECT_IOU, box_iou
 from semfov.observation.thresholds import Thresholds
 from semfov.zoom.belief import ZoomBelief
 from semfov.zoom.certainty import BY_SCORE, LIKELY, Certainty
-from semfov.zoom.closer import TargetFacts, WindowPlaces
+from semfov.zoom.closer import USUAL_WINDOW, closer_window
 from semfov.zoom.hints import DETECTION_SCORE
-from semfov.zoom.looks import WindowLook
+from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.objects import merge_with_facts
 
 _NOTHING = 1e-3  # probability of a place where looks show no object of the target
+_WHOLE = 0.9  # share of a picture from which on a window shows no more than the look at the whole
+_AS_CLOSE = 0.5  # share of the magnification of a closer look from which on a look places objects about as exactly
 
 
 class _LookFacts(NamedTuple):
@@ -110,6 +115,13 @@ class SearchFacts:
         return self._objects
 
     @torch.no_grad()
+    def places(self) -> tuple[Objects, Tensor]:
+        """List the objects of the target, with the probability `(M,)` that a search finds it where each is."""
+        objects, chances = self.objects()
+        photograph = self.belief.photograph
+        return objects, chances if photograph is None else photograph.at_place(chances).sigmoid()
+
+    @torch.no_grad()
     def expected(self) -> float:
         """Estimate how many objects of the target there are: those that looks show, and those that looks would find."""
         _, chances = self.objects()
@@ -132,29 +144,76 @@ class SearchFacts:
         return float(self.belief.evidence.presence(best, torch.tensor(self.expected())).sigmoid())
 
 
-class ObjectPlaces(WindowPlaces):
-    """Objects of the target in a large picture, each with the probability that it is there, by all looks that count.
+class TargetFacts(NamedTuple):
+    """What is known of the target after one look of a search, by the prior of the fit, and what the look shows.
+
+    Attributes:
+        detections: what the look shows (`WindowLook.detections`).
+        next_index: index of the next look of the path, from 0.
+        presence: probability that the picture holds the target.
+        hit_chance: chance that the best remaining window shows the target.
+        window: that of the look; None if it does not matter.
+    """
+
+    detections: Detections
+    next_index: int
+    presence: float
+    hit_chance: float
+    window: Window | None = None
+
+
+class _ShownWindow(NamedTuple):
+    """A window that was looked at: the number of the look in the path, and what it shows."""
+
+    number: int
+    detections: Detections
+
+
+class ObjectPlaces(CandidatePlaces[TargetFacts]):
+    """Objects of the target, each with the probability that it is there, by all looks that count.
 
     This one number tells which place is looked at closely next, and how probable a place is after a closer look, which
     is one more look. With another prior than that of the fit a place keeps its share of the picture's probability
-    (`semfov.belief.prior.Prior`). In a stream the objects are those in the present frame.
+    (`semfov.belief.prior.Prior`). In a stream the objects are those in the present frame. An object that fills the
+    picture needs no closer look: the look at the whole shows it as closely.
 
     Attributes:
         facts: what the looks of the search have shown.
+
+    Private attributes: `_look` is the last look of the search. `_shown` has what windows of the present picture showed:
+    that of the whole, unless other frames or a motion of the camera have followed. `_latest_showing` has the box of the
+    place that was asked for last, and its window.
     """
 
+    _look: TargetFacts
+
     def __init__(self, facts: SearchFacts, forgetting: Forgetting | None = None, prior: Prior | None = None) -> None:
-        super().__init__(facts.belief.target, facts.belief.lattice, forgetting, prior)
+        super().__init__(forgetting, prior)
+        photograph = facts.belief.photograph
         self.facts = facts
+        self.target = facts.belief.target
+        self._lattice = facts.belief.lattice
+        self._window = USUAL_WINDOW if photograph is None else photograph.window
+        self._shown: dict[Window, _ShownWindow] = {}
+        self._latest_showing: tuple[Tensor, Window] | None = None
+
+    def see(self, look: TargetFacts) -> None:
+        """Take in a look of the search. Looks before the first one that shows the target may be left out."""
+        self._look = look
+        self._next = look.next_index
+        self.detections = look.detections
+        self.presence = self.prior(look.presence)
 
     @property
     def hit_chance(self) -> float:
-        """Chance that the best window that was not looked at shows the target."""
+        """Chance that the best window that was not looked at shows the target; below 0 if none is left."""
+        if self._look.hit_chance == 0:
+            return -1.0  # below a `stop_below` of 0, too, so that a search without another window is over
         return self.prior.at_place(self._look.hit_chance, self._look.presence)
 
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
         """Take the surest object that was not examined, if it is likely, or at the end as probable as `place`."""
-        objects, chances = self.facts.objects()
+        objects, chances = self.facts.places()
         chances = chances.masked_fill(self._are_examined(objects.boxes), 0)
         if not len(chances):
             return None
@@ -174,7 +233,7 @@ class ObjectPlaces(WindowPlaces):
             The probability that it is there, by the prior of the fit, and its box `(4,)`; for none the least one, and
             the same box.
         """
-        objects, chances = self.facts.objects()
+        objects, chances = self.facts.places()
         overlaps = box_iou(objects.boxes, box[None].to(objects.boxes))[:, 0]
         chances_there = chances * (overlaps >= SAME_OBJECT_IOU)
         if not bool((chances_there > 0).any()):
@@ -191,9 +250,73 @@ class ObjectPlaces(WindowPlaces):
         """Change the probability of a place from the prior of the fit."""
         return self.prior.at_place(place, self.facts.presence())
 
+    def keep_whole(self, number: int, detections: Detections) -> None:
+        """Keep what the look at the whole of the present frame shows: no closer look at what fills it is needed.
+
+        Args:
+            number: number of the look in the path, from 0.
+            detections: what it shows, a batch of one.
+        """
+        self._shown[Window.overview(self._lattice)] = _ShownWindow(number, detections)
+
+    def shown_at(self, candidate: CandidatePlace) -> Detections | None:
+        """Find what the look at the window of a place showed; None where there was none."""
+        look = self._shown.get(self._showing(candidate))
+        return None if look is None else look.detections
+
+    def closer_magnification(self, candidate: CandidatePlace) -> float:
+        """Compute the magnification of the window of a closer look."""
+        return self._showing(candidate).fixation[2]
+
+    def places_exactly(self, box: Tensor, magnification: float) -> bool:
+        """Tell whether the last look is about as close as a closer look, and its border does not cut a box."""
+        window = self._look.window
+        if window is None:
+            return True
+        left, top, right, bottom = window.region(self._lattice)
+        width, height = self._lattice.size
+        x1, y1, x2, y2 = box.tolist()
+        is_inside_across = (x1 >= left or left <= 0) and (x2 <= right or right >= width)
+        is_inside_down = (y1 >= top or top <= 0) and (y2 <= bottom or bottom >= height)
+        return is_inside_across and is_inside_down and window.fixation[2] >= _AS_CLOSE * magnification
+
+    def _showing(self, candidate: CandidatePlace) -> Window:
+        """Find the window that shows a place closely, which is asked for several times in turn."""
+        if self._latest_showing is None or self._latest_showing[0] is not candidate.box:
+            self._latest_showing = candidate.box, self._window_showing(candidate)
+        return self._latest_showing[1]
+
+    def _window_showing(self, candidate: CandidatePlace) -> Window:
+        """Choose the window of a closer look at a place, or the whole picture where it shows no more."""
+        window = closer_window(self._lattice, candidate.box, self._window)
+        x1, y1, x2, y2 = window.region(self._lattice)
+        if (x2 - x1) * (y2 - y1) >= _WHOLE * math.prod(self._lattice.size):
+            return Window.overview(self._lattice)
+        return window
+
+    def count_look(self, candidate: CandidatePlace) -> None:
+        """Give the look the next number, or that of the look at the whole where it shows the place as closely."""
+        shown = self._shown.get(self._showing(candidate))
+        if shown is None:
+            super().count_look(candidate)
+        else:
+            self._index = shown.number
+
+    def wait(self, passed: float = FRAME) -> None:
+        """Let seconds pass."""
+        super().wait(passed)
+        # Windows of earlier frames showed another scene.
+        if self.forgetting.rate:
+            self._shown.clear()
+
+    def follow(self, camera: CameraStep) -> None:
+        """Carry examined places along with the camera, whose windows show others now."""
+        self._shown.clear()
+        super().follow(camera)
+
 
 class ObjectVerifier(PlaceVerifier[TargetFacts]):
-    """Decides a search of a large picture: a place is as probable as the object of the target there.
+    """Decides a search by windows: a place is as probable as the object of the target there.
 
     A closer look is one more look at the picture, which `facts` have before it is judged. The place
     has the probability of the surest object whose box overlaps that of the candidate, and its box. The probability of
@@ -207,7 +330,7 @@ class ObjectVerifier(PlaceVerifier[TargetFacts]):
 
     def _judge(self, candidate: CandidatePlace, detections: Detections) -> Judgement:
         places = self.places
-        places.telling(candidate, detections)
+        places.count_look(candidate)
         place, box = places.object_at(candidate.box)
         places.dismiss(candidate, box)
         prior = places.prior

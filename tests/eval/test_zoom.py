@@ -12,7 +12,6 @@ from eval.zoom.observed import ObservedRates
 from eval.zoom.orders import sparse
 from eval.zoom.run import ZoomConfig
 from semfov import FovealObservationModel, InputError, WindowEye
-from semfov.observation.thresholds import Thresholds
 from semfov.zoom.hints import Gist
 from semfov.zoom.lattice import Lattice
 from semfov.zoom.looks import LiveWindowLooks, Window
@@ -122,14 +121,13 @@ def test_each_photograph_is_judged_with_evidence_of_all_other_folds(monkeypatch)
         settings.append(chosen)
 
     monkeypatch.setattr(folds, "fit_photographs", fit)
-    verification = SimpleNamespace(thresholds=Thresholds(0.9, 0.1, 0.1))
-    records = folds.outcomes_in_folds(_run(7, 3, SimpleNamespace(window=(0.3, 3.0), verification=verification)))
+    records = folds.outcomes_in_folds(_run(7, 3, SimpleNamespace(window=(0.3, 3.0))))
     assert sorted(record["scene"] for record in records) == [100, 101, 102, 103, 104, 105, 106]
     for record in records:
         part = {100 + number for number in range(7) if number % 3 == (record["scene"] - 100) % 3}
         assert {*record["fitted to"]} == {100 + number for number in range(7)} - part
     assert [each.photographs for each in settings] == [4, 5, 5]
-    assert {(each.window, each.stop_below, each.seed) for each in settings} == {((0.3, 3.0), 0.1, 3)}
+    assert {(each.window, each.seed) for each in settings} == {((0.3, 3.0), 3)}
 
 
 def test_folds_need_as_many_photographs_and_no_mosaics():

@@ -172,7 +172,7 @@ FITS = {
     "observation": "observation.fit_published",
     "search": "search_part.fit_search",
     "verification": "verification_part.fit_in_folds",
-    "windows": "windows_part._fit_mosaics",
+    "windows": "windows_part.MosaicFit",
 }
 
 

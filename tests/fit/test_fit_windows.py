@@ -5,8 +5,10 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
+from scipy.optimize import minimize
 
 from semfov import ActivePerception, EmbeddedScenes
 from semfov.agents import ZoomAgent
@@ -16,7 +18,7 @@ from semfov.data import Annotation, Scene
 from semfov.data.mosaics import Mosaics
 from semfov.errors import DataError
 from semfov.fit.folder import FolderFit
-from semfov.fit.photographs import _explored, fit_photographs
+from semfov.fit.photographs import _explored, _fit_places, fit_photographs
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.windows import MosaicFit
 from semfov.fit.windows_decisions import choose_places, search_pictures
@@ -37,6 +39,7 @@ from semfov.settings import FindSettings
 from semfov.zoom import GlimpseEvidence, Lattice, WindowEye
 from semfov.zoom.certainty import SPREAD
 from semfov.zoom.episode import look_by_look
+from semfov.zoom.evidence import PhotographEvidence
 from semfov.zoom.looks import LiveWindowLooks, Window
 from semfov.zoom.slices import ranked, usual_slices
 from tests.colours import COLOURS, write_home
@@ -280,7 +283,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
         stored.setattr("semfov.data.mosaics.Mosaics.__getitem__", None)
         assert folder_of(home).fit("windows") == fitted
     assert (home / "models/windows.safetensors").read_bytes() == before
-    monkeypatch.setattr("semfov.fit.windows_part._fit_mosaics", None)
+    monkeypatch.setattr("semfov.fit.windows_part.MosaicFit", None)
     folder = folder_of(home)
     assert folder.fit("windows") == fitted
     part = replace(fitted.part, used=True)
@@ -312,7 +315,7 @@ def test_the_agent_of_the_folder_has_the_evidence_and_an_interrupted_fit_continu
     ],
 )
 def test_the_evidence_is_left_out_with_a_reason(home, tmp_path, monkeypatch, settings, why):
-    monkeypatch.setattr("semfov.fit.windows_part._fit_mosaics", None)
+    monkeypatch.setattr("semfov.fit.windows_part.MosaicFit", None)
     folder = folder_of(home, out=tmp_path, **settings)
     assert folder.fits["windows"].tasks == {}
     part = folder.fit("windows").part
@@ -406,7 +409,7 @@ def fitted():
         model,
         Photographs(),
         eye,
-        SimpleNamespace(photographs=COUNT, stop_below=0.1, window=(0.6, 2.0), surest=0.9, seed=0),
+        SimpleNamespace(photographs=COUNT, window=(0.6, 2.0), surest=0.9, seed=0),
     )
     return model, eye, report
 
@@ -462,3 +465,27 @@ def test_a_photograph_without_objects_has_no_most_frequent_class():
     source = LiveWindowLooks(eye, eye.open(Photographs()[0].image))
     told = [*_explored(source.see([Window.overview(source.lattice)]), source.lattice, empty)]
     assert [(each.target, each.held) for each in told] == [(None, 0)]
+
+
+def test_places_are_fitted_near_the_certainty_of_objects():
+    """The regression of scipy's minimiser, with a normal prior around the identity."""
+    torch.manual_seed(0)
+    certainty = torch.rand(80) * 0.9 + 0.05
+    right = torch.rand(80) < (0.6 * certainty.logit() + 1).sigmoid()
+    searches = [SimpleNamespace(spare=False, places=[*zip(certainty[:50].tolist(), right[:50].tolist(), strict=True)])]
+    searches += [SimpleNamespace(spare=False, places=[*zip(certainty[50:].tolist(), right[50:].tolist(), strict=True)])]
+    searches += [SimpleNamespace(spare=True, places=[(0.9, False)] * 50)]  # for thresholds alone
+    evidence = PhotographEvidence(3).requires_grad_(False)
+    _fit_places(evidence, searches)
+    x, y = certainty.double().logit().numpy(), right.double().numpy()
+
+    def loss(coefficients):
+        offset, slope = coefficients
+        z = offset + slope * x
+        return (np.logaddexp(0, z) - y * z).sum() + offset**2 / 2 + 10 * (slope - 1) ** 2
+
+    expected = minimize(loss, [0.0, 1.0], tol=1e-10).x
+    found = [float(evidence.place.bias), float(evidence.place.weight)]
+    assert found == pytest.approx(expected.tolist(), abs=1e-4)
+    _fit_places(evidence, [])
+    assert [float(evidence.place.bias), float(evidence.place.weight)] == [0.0, 1.0]
