@@ -212,14 +212,19 @@ class ObjectPlaces(CandidatePlaces[TargetFacts]):
         return self.prior.at_place(self._look.hit_chance, self._look.presence)
 
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
-        """Take the surest object that was not examined, if it is likely, or at the end as probable as `place`."""
+        """Take the surest object that was not examined, if it is likely, or at the end as probable as `place`.
+
+        It has to be so by the prior of the fit, too: of fainter objects the fit knows nothing, however frequent the
+        target is.
+        """
         objects, chances = self.facts.places()
         chances = chances.masked_fill(self._are_examined(objects.boxes), 0)
         if not len(chances):
             return None
         surest = int(chances.argmax())
-        probability = self._with_prior(float(chances[surest]))
-        if probability < max(thresholds.place if last else LIKELY, _NOTHING):
+        fitted = float(chances[surest])
+        probability = self._with_prior(fitted)
+        if min(fitted, probability) < max(thresholds.place if last else LIKELY, _NOTHING):
             return None
         return CandidatePlace(objects.boxes[surest], float(objects.scores[surest]), probability)
 

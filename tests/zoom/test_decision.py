@@ -403,10 +403,12 @@ def test_mixed_precision_does_not_round_whether_a_picture_holds_a_class():
     evidence = GlimpseEvidence.from_pretrained("yolox-nano").requires_grad_(False)
     best = torch.rand(50, generator=torch.Generator().manual_seed(0))
     target = torch.arange(1, 51)
-    exact = evidence.presence(best, 3 * best), evidence.photograph.presence(best, 3 * best, target)
+    own = evidence.photograph
+    exact = evidence.presence(best, 3 * best), own.presence(best, target), own.at_place(best)
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(evidence.presence(best, 3 * best), exact[0])
-        assert torch.equal(evidence.photograph.presence(best, 3 * best, target), exact[1])
+        assert torch.equal(own.presence(best, target), exact[1])
+        assert torch.equal(own.at_place(best), exact[2])
 
 
 def test_mixed_precision_does_not_round_the_facts_of_a_certainty():
