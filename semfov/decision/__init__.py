@@ -40,7 +40,7 @@ presence does (`settle`):
     what                         fovea                                   windows
     ---------------------------  --------------------------------------  -----------------------------------------------
     hit_chance < stop_below: no  of the best cell that was not fixated   of the best window that was not looked at; in a
-    look is worth a pass                                                 photograph none is left after the whole
+    look is worth a pass                                                 photograph of the next closer look
     >= confirm, with closer      place of a closer look                  as a fovea
     looks
     >= confirm, without          presence, if a fixated cell is nearly   presence, if a detection shows the target

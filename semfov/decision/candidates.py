@@ -159,7 +159,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
 
         Args:
             candidate: the place.
-            detections: what a closer look shows, a batch of one, or what an earlier look has shown (`shown_at`).
+            detections: what a closer look shows, a batch of one.
 
         Returns:
             The features `(7,)` of the look (`closer_features`), and the box `(4,)` of the target in it.

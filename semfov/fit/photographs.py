@@ -39,7 +39,7 @@ LEAST_CERTAINTY = 0.02
 """Least certainty of an object that is worth a closer look (docs/decisions/closer_looks.md)."""
 
 _STRENGTH = 20.0
-"""Strength with which a place stays the more probable the surer the object is that is there, also if few are known."""
+"""Strength with which the weight of the certainty is held near 1, which matters where few places are known."""
 
 _AREA = 0.2  # classes that cover a larger share of a photograph are not searched for
 
@@ -135,7 +135,7 @@ def fit_photographs(model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, co
         return "None, since no photograph is shown at more than half its size by one look.\n"
     held = _classes_held(pictures, model.classes)
     # With `confirm` 1 all closer looks are made, so that any threshold can be applied to a search afterwards.
-    limits = Thresholds(1.0, LEAST_CERTAINTY, LEAST_CERTAINTY)
+    limits = Thresholds(1.0, LEAST_CERTAINTY)
     evidence = PhotographEvidence(model.classes, window=config.window, thresholds=limits).eval().requires_grad_(False)
     evidence.usual.copy_(_log_odds_held(held.sum(0), len(pictures)))
     model.photograph = evidence
@@ -150,7 +150,7 @@ def fit_photographs(model: GlimpseEvidence, pictures: Scenes, eye: WindowEye, co
     _fit_places(evidence, looks.searches)
     least = float(evidence.at_place(torch.tensor(LEAST_CERTAINTY)).sigmoid())
     confirm = choose_confirm(searches, _FALSE_ALARMS, config.surest)
-    evidence.thresholds = Thresholds(confirm, least, least)
+    evidence.thresholds = Thresholds(confirm, round(least, 3))
     model.metadata["photograph"] = {"photographs": len(looked), "frequencies": len(pictures)}
     report = places_report(searches, confirm, f"{len(looked)} photographs")
     return "\n".join([*report, *report_on_spread])
@@ -209,7 +209,10 @@ def _search_in_folds(model: GlimpseEvidence, looks: _PhotographLooks) -> None:
 
 
 def _fit_presence(evidence: PhotographEvidence, searches: Sequence[_PhotographSearch], held: Tensor) -> None:
-    """Fit the probability of a class after each look of a search, with its frequency in the other photographs."""
+    """Fit the probability of a class after each look of a search, with its frequency in the other photographs.
+
+    A search counts once for each of its looks.
+    """
     totals = held.sum(0)
     best: list[float] = []
     holding: list[int] = []
@@ -235,6 +238,9 @@ def _fit_places(evidence: PhotographEvidence, searches: Sequence[_PhotographSear
     right = torch.tensor([is_right for _, is_right in places])
     near = torch.tensor([0.0, 1.0], dtype=torch.float64), torch.tensor([1.0, _STRENGTH], dtype=torch.float64)
     offset, weight = logistic_regression(certainty.logit(1e-4)[:, None], right, prior=near)
+    if weight <= 0:
+        # A few places that are wrong where objects are sure, and right elsewhere, tell nothing.
+        offset, weight = 0.0, 1.0
     evidence.place.weight.fill_(weight)
     evidence.place.bias.fill_(offset)
 

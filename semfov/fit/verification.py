@@ -244,9 +244,7 @@ def examined_places(search: TargetSearch[LookType]) -> Iterator[ExaminedLook]:
             candidate = candidates.due(least, last=True)
             if candidate is None:
                 break
-            detections = candidates.shown_at(candidate)
-            if detections is None:
-                detections = search.close_up(candidate.box)
+            detections = search.close_up(candidate.box)
             yield ExaminedLook(looks, candidate, detections, *candidates.examine(candidate, detections))
 
 

@@ -118,7 +118,7 @@ def _decisions(searches: Sequence[VerifiedSearch], chosen: float) -> list[list[s
     head = ["confirm", "hit rate", "false-alarm rate", "place right", "looks, target present", "looks, target absent"]
     rows = [head]
     unverified = [search.unverified for search in searches if search.unverified is not None]
-    if len(unverified) == len(searches):  # windows of a photograph have no decision without closer looks
+    if len(unverified) == len(searches):  # searches by windows have no decision without closer looks
         rows.append(["no closer looks", *_rates(present, unverified)])
     for confirm in sorted({*_THRESHOLDS, chosen}):
         mark = " (chosen)" if confirm == chosen else ""

@@ -39,7 +39,7 @@ _STRENGTHS = tuple(2.0**n for n in range(-2, 9))
 _FAINT = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0)
 _PROMISES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 
-_SPREADS = tuple(0.05 * n for n in range(41))
+_SPREADS = tuple(n / 20 for n in range(41))
 _FEW = 40  # below this number of claims the spread is not less than that of a model for which none was fitted
 _CHECKED = (8, 24)
 """Numbers of looks after which the expected number is compared with the annotated one, to fit its spread."""

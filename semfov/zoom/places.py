@@ -23,7 +23,8 @@ from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.objects import merge_with_facts
 
-_NOTHING = 1e-3  # probability of a place where looks show no object of the target
+_NOTHING = 1e-3  # certainty of an object that looks do not show
+_NONE_LEFT = -1.0  # chance of a hit where no look is left, below a `stop_below` of 0, too: the search is over
 _WHOLE = 0.9  # share of a picture from which on a window shows no more than the look at the whole
 _AS_CLOSE = 0.5  # share of the magnification of a closer look from which on a look places objects about as exactly
 
@@ -118,8 +119,20 @@ class SearchFacts:
     def places(self) -> tuple[Objects, Tensor]:
         """List the objects of the target, with the probability `(M,)` that a search finds it where each is."""
         objects, chances = self.objects()
+        return objects, self.at_place(chances)
+
+    @torch.no_grad()
+    def at_place(self, certainty: Tensor) -> Tensor:
+        """Compute the probability that a search finds the target where an object is.
+
+        Args:
+            certainty: `(...)`, probabilities of objects.
+
+        Returns:
+            `(...)`; in a large picture they are the same.
+        """
         photograph = self.belief.photograph
-        return objects, chances if photograph is None else photograph.at_place(chances).sigmoid()
+        return certainty if photograph is None else photograph.at_place(certainty).sigmoid()
 
     @torch.no_grad()
     def expected(self) -> float:
@@ -162,8 +175,8 @@ class TargetFacts(NamedTuple):
     window: Window | None = None
 
 
-class _ShownWindow(NamedTuple):
-    """A window that was looked at: the number of the look in the path, and what it shows."""
+class _WholeLook(NamedTuple):
+    """The look at the whole of the present frame: its number in the path, and what it shows."""
 
     number: int
     detections: Detections
@@ -180,9 +193,9 @@ class ObjectPlaces(CandidatePlaces[TargetFacts]):
     Attributes:
         facts: what the looks of the search have shown.
 
-    Private attributes: `_look` is the last look of the search. `_shown` has what windows of the present picture showed:
-    that of the whole, unless other frames or a motion of the camera have followed. `_latest_showing` has the box of the
-    place that was asked for last, and its window.
+    Private attributes: `_look` is the last look of the search. `_whole` is the look at the whole of the present
+    picture; None before it, and where other frames or a motion of the camera have followed. `_latest_showing` has the
+    box of the place that was asked for last, and its window.
     """
 
     _look: TargetFacts
@@ -193,8 +206,9 @@ class ObjectPlaces(CandidatePlaces[TargetFacts]):
         self.facts = facts
         self.target = facts.belief.target
         self._lattice = facts.belief.lattice
+        self._is_large = photograph is None
         self._window = USUAL_WINDOW if photograph is None else photograph.window
-        self._shown: dict[Window, _ShownWindow] = {}
+        self._whole: _WholeLook | None = None
         self._latest_showing: tuple[Tensor, Window] | None = None
 
     def see(self, look: TargetFacts) -> None:
@@ -206,27 +220,37 @@ class ObjectPlaces(CandidatePlaces[TargetFacts]):
 
     @property
     def hit_chance(self) -> float:
-        """Chance that the best window that was not looked at shows the target; below 0 if none is left."""
+        """Chance that the best window that was not looked at shows the target; below 0 if none is left.
+
+        In a photograph only closer looks are left after the whole: it is that of the next one.
+        """
+        if not self._is_large:
+            _, worth = self._surest()
+            return worth
         if self._look.hit_chance == 0:
-            return -1.0  # below a `stop_below` of 0, too, so that a search without another window is over
+            return _NONE_LEFT
         return self.prior.at_place(self._look.hit_chance, self._look.presence)
 
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
-        """Take the surest object that was not examined, if it is likely, or at the end as probable as `place`.
+        """Take the surest object that was not examined, if it is likely, or at the end as probable as `place`."""
+        surest, worth = self._surest()
+        return surest if worth >= max(thresholds.place if last else LIKELY, _NOTHING) else None
 
-        It has to be so by the prior of the fit, too: of fainter objects the fit knows nothing, however frequent the
-        target is.
+    def _surest(self) -> tuple[CandidatePlace | None, float]:
+        """Find the surest object that was not examined, and the chance of a hit for which it is looked at closely.
+
+        In a photograph this chance is no larger than that by the prior of the fit: of fainter objects the fit knows
+        nothing, however frequent the target is.
         """
         objects, chances = self.facts.places()
         chances = chances.masked_fill(self._are_examined(objects.boxes), 0)
-        if not len(chances):
-            return None
+        if not bool((chances > 0).any()):
+            return None, _NONE_LEFT
         surest = int(chances.argmax())
         fitted = float(chances[surest])
         probability = self._with_prior(fitted)
-        if min(fitted, probability) < max(thresholds.place if last else LIKELY, _NOTHING):
-            return None
-        return CandidatePlace(objects.boxes[surest], float(objects.scores[surest]), probability)
+        place = CandidatePlace(objects.boxes[surest], float(objects.scores[surest]), probability)
+        return place, probability if self._is_large else min(fitted, probability)
 
     def object_at(self, box: Tensor) -> tuple[float, Tensor]:
         """Find the surest object at a place.
@@ -235,14 +259,14 @@ class ObjectPlaces(CandidatePlaces[TargetFacts]):
             box: `(4,)`.
 
         Returns:
-            The probability that it is there, by the prior of the fit, and its box `(4,)`; for none the least one, and
-            the same box.
+            The probability that it is there, by the prior of the fit, and its box `(4,)`; for none that of an object
+            that is hardly there, and the same box.
         """
         objects, chances = self.facts.places()
         overlaps = box_iou(objects.boxes, box[None].to(objects.boxes))[:, 0]
         chances_there = chances * (overlaps >= SAME_OBJECT_IOU)
         if not bool((chances_there > 0).any()):
-            return _NOTHING, box
+            return float(self.facts.at_place(torch.tensor(_NOTHING))), box
         surest = int(chances_there.argmax())
         return float(chances_there[surest]), objects.boxes[surest]
 
@@ -262,12 +286,16 @@ class ObjectPlaces(CandidatePlaces[TargetFacts]):
             number: number of the look in the path, from 0.
             detections: what it shows, a batch of one.
         """
-        self._shown[Window.overview(self._lattice)] = _ShownWindow(number, detections)
+        self._whole = _WholeLook(number, detections)
 
     def shown_at(self, candidate: CandidatePlace) -> Detections | None:
-        """Find what the look at the window of a place showed; None where there was none."""
-        look = self._shown.get(self._showing(candidate))
+        """Find what the look at the whole showed of a place, if it is as close; None elsewhere."""
+        look = self._whole_showing(candidate)
         return None if look is None else look.detections
+
+    def _whole_showing(self, candidate: CandidatePlace) -> _WholeLook | None:
+        """Find the look at the whole, if it shows a place as closely as a closer look; None elsewhere."""
+        return self._whole if self._showing(candidate).is_overview else None
 
     def closer_magnification(self, candidate: CandidatePlace) -> float:
         """Compute the magnification of the window of a closer look."""
@@ -301,22 +329,22 @@ class ObjectPlaces(CandidatePlaces[TargetFacts]):
 
     def count_look(self, candidate: CandidatePlace) -> None:
         """Give the look the next number, or that of the look at the whole where it shows the place as closely."""
-        shown = self._shown.get(self._showing(candidate))
-        if shown is None:
+        whole = self._whole_showing(candidate)
+        if whole is None:
             super().count_look(candidate)
         else:
-            self._index = shown.number
+            self._index = whole.number
 
     def wait(self, passed: float = FRAME) -> None:
         """Let seconds pass."""
         super().wait(passed)
-        # Windows of earlier frames showed another scene.
+        # An earlier frame showed another scene.
         if self.forgetting.rate:
-            self._shown.clear()
+            self._whole = None
 
     def follow(self, camera: CameraStep) -> None:
-        """Carry examined places along with the camera, whose windows show others now."""
-        self._shown.clear()
+        """Carry examined places along with the camera, whose frame shows others now."""
+        self._whole = None
         super().follow(camera)
 
 

@@ -1031,3 +1031,26 @@ def test_an_object_that_fills_a_large_picture_needs_no_closer_look():
     judge = search(0.0)
     judge.follow(CameraStep(Motion.similarity(shift=(5, 0))), LATTICE.size)
     assert judge.shown is None
+
+
+def test_a_photograph_is_not_absent_while_a_closer_look_is_due(detector, photograph):
+    """Presence is below one half, but the object that was found may still be the target."""
+    model = own_evidence(place=0.1, confirm=0.6)
+    with torch.no_grad():
+        model.photograph.whole.bias.fill_(-20.0)
+    agent = ZoomAgent(WindowEye(detector), model)
+    first = agent.search(photograph, "red", SearchSettings(passes=1))
+    assert (first.decision.outcome, first.ending) == ("undecided", "passes")
+    assert agent.search(photograph, "red").decision.outcome == "found"
+    live = agent.stream(1, (), StreamSettings(rate=0.75), follows=False)
+    assert [live.step(photograph).decision.outcome for _ in range(3)] == ["undecided", "undecided", "found"]
+
+
+def test_faint_objects_of_a_rare_class_take_no_closer_looks_in_a_photograph(detector, photograph):
+    """A prior of one half lifts them over the threshold, but the fit has seen no such places."""
+    faint = 0.02 * photograph
+    model = own_evidence(place=0.1, confirm=0.6)
+    model.photograph.shares = torch.tensor([1e-3, 0.4, 0.2])
+    search = ZoomAgent(WindowEye(detector), model).search
+    assert search(faint, "red").passes == 1
+    assert search(photograph, "red").passes > 1
