@@ -119,7 +119,7 @@ class ActivePerception(MovableModule):
         grid: tuple[int, int] = (10, 10),
         **options: Any,
     ) -> Self:
-        """Make the agent for everyday use: the paper's chain, with an observation model that was trained for its tasks.
+        """Make the agent for everyday use: the method of the paper, with observation models trained for its tasks.
 
         It sees through the `gradual` fovea, or looks at windows.
 
@@ -244,7 +244,7 @@ class ActivePerception(MovableModule):
             raise missing("an agent", name, AGENT, dir(type(self))) from None
 
     def forward(self, *arguments: object, **options: object) -> None:
-        """Refuse a call of the agent itself with the names of its methods.
+        """Raise an error that lists the agent's methods, because the agent itself cannot be called.
 
         Args:
             *arguments: any.
@@ -559,7 +559,7 @@ class ActivePerception(MovableModule):
         color: Color = "rgb",
         white: White | None = None,
     ) -> LivePerception:
-        """Look at a camera or a video, with one pass of the detector at every frame; evidence fades between frames.
+        """Look at a camera or a video, with one pass of the detector at every frame; old looks count less with time.
 
         When a place seems to hold the target, the recommended agent uses one frame for a closer look, as in `search`.
 

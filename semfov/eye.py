@@ -1,4 +1,4 @@
-"""The eye: a sensor and a detector together, which give the detections for a fixation in an image."""
+"""The eye: a sensor and a detector, which together return the detections at a fixation in an image."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -131,7 +131,7 @@ class Eye(StatedModule):
         return self.sensor.look(view.state, _on_canvas(fixations, view))
 
     def pictures(self, view: View, fixations: PointLike) -> Tensor:
-        """Compute what is seen from fixations as pictures of the canvas, for figures and environments.
+        """Compute the views from fixations as pictures, for figures and environments.
 
         Args:
             view: the opened image.
@@ -213,7 +213,7 @@ class Eye(StatedModule):
         return self.detector.canvas_features(self.foveated(view, fixations), view.placement, layers)
 
     def close_up(self, image: Tensor, box: Tensor) -> Detections:
-        """Look closely at a place: enlarge a window around it to the detector's input, and detect.
+        """Take a closer look at a place: enlarge a window around it to the detector's input, and detect.
 
         The window (`semfov.sensor.glimpse.window_around`) is taken from the image itself and not from its canvas, and
         the sensor is not applied. It shows small objects larger than any look at the whole image. One such look costs

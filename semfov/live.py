@@ -1,4 +1,4 @@
-"""Active perception of a camera or a video: one look at every frame, and evidence that fades between frames."""
+"""Active perception of a camera or a video: one look at every frame; old looks count less with time."""
 
 import sys
 from typing import NoReturn

@@ -28,7 +28,7 @@ PUBLISHED_SENSORS = tuple(name for name, named in SENSORS.items() if named.publi
 
 
 def option_names(make: Callable[..., dict[str, Any]]) -> list[str]:
-    """List the options of a constructor: those of a function of this module, and those of `load_detector`."""
+    """List the options of a preset's constructor, which include the options of `load_detector`."""
     passed_on = [
         parameter.name
         for parameter in signature(make).parameters.values()
@@ -39,7 +39,7 @@ def option_names(make: Callable[..., dict[str, Any]]) -> list[str]:
 
 
 def recommended_arguments(name: DetectorLike, /, grid: tuple[int, int], **options: Any) -> dict[str, Any]:
-    """Make the arguments of the recommended agent, which searches and explores by learned observation models."""
+    """Make the arguments of `ActivePerception.recommended`, the agent with learned observation models."""
     check_cells(grid)
     detector = load_detector(name, **options)
     eye = Eye(named_sensor("gradual"), detector)
@@ -66,7 +66,7 @@ def model_file_arguments(
     grid: tuple[int, int] = (10, 10),
     **options: Any,
 ) -> dict[str, Any]:
-    """Make the arguments of the recommended agent with the model of a file in place of the shipped one of its kind."""
+    """Make the arguments of the recommended agent, with the model in a file instead of a shipped one."""
     model = open_model(path)
     if detector is None:
         detector = model.metadata.get("detector", {}).get("name")
@@ -90,7 +90,7 @@ def model_file_arguments(
 
 
 def published_model(detector: str, sensor: str, threshold: float) -> str:
-    """Name the observation model of the published agent.
+    """Return the name of the shipped observation model for `ActivePerception.published`.
 
     Args:
         detector: name of the detector.
@@ -109,7 +109,7 @@ def published_model(detector: str, sensor: str, threshold: float) -> str:
 def published_arguments(
     name: str | PathLike[str], /, sensor: str | None, search: str, calibrated: bool, **options: Any
 ) -> dict[str, Any]:
-    """Make the arguments of the published agent, by the name of a detector or from a folder of models."""
+    """Make the arguments of `ActivePerception.published`, from a detector's name or a folder of models."""
     lookup(search, ["predictive", "non-predictive"], "published search policy")
     folder = open_folder(name)
     if folder is not None:
@@ -130,7 +130,7 @@ def published_arguments(
 
 
 def raw_arguments(name: DetectorLike, /, sensor: str, **options: Any) -> dict[str, Any]:
-    """Make the arguments of the raw agent: raw scores as likelihoods, and random exploration."""
+    """Make the arguments of `ActivePerception.raw`: scores are likelihoods, and explorations are random."""
     eye = Eye(named_sensor(sensor), load_detector(name, **options))
     observer = Semantic(len(eye.detector.classes) + 1)
     search = (observer, Policy("non-predictive"))

@@ -1,4 +1,4 @@
-"""The settings of each task: made once where a task is asked for, read by its episode, and shown as its options.
+"""The settings of each task: arguments in Python, options of the command, and read by the episode.
 
 The fields of these classes are the keywords of `ActivePerception.search`, `find_all`, `explore` and `live`, and the
 options of the commands, which take their names, types and help from here. In all of them None is the default that suits
@@ -60,7 +60,7 @@ _INSTEAD = "instead"  # metadata of a field: what a message suggests for other k
 
 
 def value_or(setting: _Value | None, usual: _Value) -> _Value:
-    """Take a setting, or the usual value of who asks where it is None."""
+    """Return the value of a setting, or a default if it is None."""
     return usual if setting is None else setting
 
 
@@ -169,7 +169,7 @@ class DecisionSettings(CheckedSettings):
 
     @property
     def given_share(self) -> float | None:
-        """The prior that was given as a number."""
+        """The prior if it is a number; None otherwise."""
         return None if self.prior == "fit" else self.prior
 
 
@@ -310,7 +310,7 @@ def help_of(kind: type[CheckedSettings]) -> dict[str, str]:
 
 
 def documented_by(kind: type[CheckedSettings]) -> Callable[[_Function], _Function]:
-    """Decorate a function whose keywords are settings: their help follows that of its other arguments.
+    """Decorate a function whose keywords are settings, and add their help to its docstring.
 
     Args:
         kind: dataclass of the settings.
@@ -329,7 +329,7 @@ def documented_by(kind: type[CheckedSettings]) -> Callable[[_Function], _Functio
 
 
 def suitable_kinds(setting: Field[Any]) -> tuple[tuple[str, ...], str]:
-    """Find the kinds of look that a setting means something to.
+    """Find the kinds of look that have a setting.
 
     Args:
         setting: a field of the settings of a task.

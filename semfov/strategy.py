@@ -17,7 +17,7 @@ from semfov.observation.presence import EVEN
 
 
 def classes_named(target: TargetLike) -> list[str | int]:
-    """List the classes that a target names: itself, or several of which any is searched for.
+    """List the classes of a target, which may be one class or any of several.
 
     Args:
         target: a class by name or index, several in a list, or several with weights.
@@ -50,7 +50,7 @@ class Strategy(nn.Module):
         return self.policy(target, grid)
 
     def with_prior(self, prior: PriorLike, target: int) -> tuple["Strategy", Prior]:
-        """Change a search for a class by how often it is there.
+        """Make the strategy for a search in which the target is present with a given prior.
 
         Args:
             prior: share of searches in which the class is there (`Prior.of`).

@@ -1,4 +1,4 @@
-"""Agents and their episodes: a fovea at a photograph, windows of a large picture, and a head that turns."""
+"""Agents and their episodes, for each kind of look: a fovea, windows of a picture, and a head that turns."""
 
 from semfov.agents.head import HeadAgent
 from semfov.agents.windows import ZoomAgent

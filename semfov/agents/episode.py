@@ -1,4 +1,4 @@
-"""Episodes under way, whose looks, decision and record can be asked for at any time: of a picture, and of a stream.
+"""Base classes of episodes of a picture or a stream; looks, decision and record are available at any time.
 
 An `Episode` has a goal, and the looks, the decision and the record so far. A `PictureEpisode` looks when it is asked,
 and `run` looks until the decision or a limit. A `StreamEpisode` looks once at each frame that `step` is given, and its
@@ -52,7 +52,7 @@ class EpisodeLimits:
 
     @classmethod
     def of(cls, settings: LookSettings, usual: int | None = None) -> Self:
-        """Begin the time of an episode with the limits of its settings.
+        """Make the limits from the settings of an episode, and start its clock.
 
         Args:
             settings: the settings of its task.
@@ -64,7 +64,7 @@ class EpisodeLimits:
         return cls(value_or(settings.passes, usual), settings.seconds, settings.on_look)
 
     def reached(self, passes: int, record: Callable[[], Record]) -> Literal["stopped", "passes", "seconds"] | None:
-        """Find the limit that is reached after a look. Call it once after each look.
+        """Return the limit that the last look has reached, if any. Call it once after each look.
 
         Args:
             passes: number of passes of the detector so far.
@@ -80,11 +80,11 @@ class EpisodeLimits:
         return None
 
     def elapsed(self) -> float:
-        """Seconds since the limits were made, when the episode began: its clock."""
+        """Seconds since the episode began, when its limits were made."""
         return perf_counter() - self._began
 
     def room(self, passes: int) -> float:
-        """Count the passes that remain after some; infinite without a limit."""
+        """Compute how many passes of the detector remain; infinite without a limit."""
         return value_or(self.passes, inf) - passes
 
 
@@ -106,7 +106,7 @@ class Goal:
 
     @classmethod
     def of(cls, classes: Sequence[str], target: int | None = None, targets: Sequence[int] = ()) -> "Goal":
-        """Make the goal of a search for a target, or of finding all objects of some classes, or of all."""
+        """Make the goal: to search for a target, or to find all objects of the given classes, or of every class."""
         searches = target is not None
         if len(targets) > 1:
             return cls(tuple(classes), target, tuple(targets), searches)
@@ -115,12 +115,12 @@ class Goal:
 
     @property
     def searched(self) -> int | None:
-        """The class that one object of is searched for; None for other goals."""
+        """The class of which a search looks for one object; None for other goals."""
         return self.target if self.searches else None
 
     @property
     def sought(self) -> tuple[int, ...]:
-        """The classes that are looked for; none stands for all."""
+        """The classes that are looked for; an empty tuple stands for every class."""
         return sought_classes(self.target, self.targets)
 
     def describe(self) -> str:
@@ -132,7 +132,7 @@ class Goal:
 
 
 class Episode(ABC, Generic[_Record_co]):
-    """Base of what is under way: a search, finding all objects, or an exploration.
+    """Base of running episodes: searches, finds of all objects, and explorations.
 
     Looks, decision, record and criterion hold at any time: before the first look, after any, and after the end.
 
@@ -150,17 +150,17 @@ class Episode(ABC, Generic[_Record_co]):
     @property
     @abstractmethod
     def looks(self) -> tuple[RecordedLook, ...]:
-        """The looks that count so far, as the record has them."""
+        """The looks so far that have not been forgotten, as in the record."""
 
     @property
     @abstractmethod
     def decision(self) -> Decision | None:
-        """The decision of a search as it stands; None where nothing is decided, and before the first look."""
+        """The present decision of a search; None before the first look, and in episodes without a decision."""
 
     @property
     @abstractmethod
     def criterion(self) -> str | None:
-        """What a search needs for the decision `found`, in words; None where nothing is decided."""
+        """What a search needs to say `found`, in words; None in episodes without a decision."""
 
     @abstractmethod
     def record(self) -> _Record_co:
@@ -190,7 +190,7 @@ class PictureEpisode(Episode[_Record_co]):
 
     @property
     def passes(self) -> int:
-        """Number of passes of the detector so far: of all looks, closer ones included."""
+        """Number of passes of the detector so far, closer looks included."""
         return len(self.looks)
 
     @abstractmethod
@@ -214,7 +214,7 @@ class PictureEpisode(Episode[_Record_co]):
 
 
 class StreamEpisode(Episode[_Moment_co]):
-    """Base of the episodes of a stream, each frame of which is given to `step`. They have no end.
+    """Base of the episodes of a stream, which have no end: `step` takes the next frame.
 
     The photograph of a moment is made when it is read: most are never read, and reducing a large frame takes as long as
     half of a look.
@@ -261,7 +261,7 @@ class StreamEpisode(Episode[_Moment_co]):
         """Spend a frame on a look."""
 
     def moment(self) -> _Moment_co:
-        """Give the record of the present frame, after the first one."""
+        """Return the record of the present frame; there must have been a first frame."""
         if self._moment is None:
             raise InputError("moment: expected a frame before it, got none; call step with a frame first")
         return self._moment
@@ -278,7 +278,7 @@ class StreamEpisode(Episode[_Moment_co]):
                 _ = older.photograph
 
     def record(self) -> _Moment_co:
-        """Make the record of what counts at the present frame: its moment."""
+        """Return the record of the present frame (its moment), with all looks that have not been forgotten."""
         return self.moment()
 
     def _check_size(self, size: tuple[int, int]) -> None:
@@ -290,7 +290,7 @@ class StreamEpisode(Episode[_Moment_co]):
 
 
 def on_cpu(module: _Module) -> _Module:
-    """Copy a module to the CPU, without moving the one that is given, which other parts of the agent may share.
+    """Copy a module to the CPU; the original, which other parts of the agent may share, stays where it is.
 
     Its tensors are copied from a GPU together, since each copy waits for it. All else is shared.
 

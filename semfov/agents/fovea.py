@@ -27,7 +27,7 @@ class FoveaAgent(GazeParts):
     """The part of an agent that moves its gaze over a photograph."""
 
     def search(self, image: Tensor, target: TargetLike, settings: SearchSettings) -> Scanpath:
-        """Search a photograph for a target, and decide whether it is there (`ActivePerception.search`).
+        """Search a photograph for a target, and decide whether the photograph holds it (`ActivePerception.search`).
 
         Args:
             image: the photograph, `(1, 3, H, W)`.
@@ -42,7 +42,7 @@ class FoveaAgent(GazeParts):
     def open_search(
         self, image: Tensor, target: TargetLike, settings: SearchSettings, cells: Sequence[int] | None = None
     ) -> FoveaEpisode:
-        """Open a search of a photograph, before its first look.
+        """Make the episode of a search in a photograph, which has not taken a look yet.
 
         Args:
             image: the photograph, `(1, 3, H, W)`.

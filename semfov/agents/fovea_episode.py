@@ -62,7 +62,7 @@ class GazeParts:
 
 
 class GazePlan:
-    """How a gaze moves and what ends it, before there is a picture. Its models are on the CPU, wherever the eye is.
+    """Rules for choosing fixations and for ending an episode, for any picture. All models are on the CPU.
 
     Args:
         agent: the eye, the strategies and the verification.
@@ -152,7 +152,7 @@ class GazePlan:
         return Grid(*self.agent.cells, (image.shape[-1], image.shape[-2]))
 
     def choice(self, grid: Grid, like: Tensor) -> Choice:
-        """Make the choice of the next cell: the given ones, as people choose, or the one with the largest value."""
+        """Make the rule that chooses the next cell: given cells, cells as people choose them, or the best cell."""
         if self._cells is not None:
             return Given(self._cells)
         if self._viewed is not None:
@@ -161,7 +161,7 @@ class GazePlan:
         return Greedy(drawn_by(self._generator, len(grid), like))
 
     def criterion(self, grid: Grid) -> StoppingCriterion:
-        """Make the usual stopping criterion: by closer looks where they are fitted, else by the presence."""
+        """Make the default stopping criterion: by closer looks if a model of them was fitted, else by the presence."""
         if self.target is None or self.thresholds is None:
             return StoppingCriterion()
         if self.verification is not None:
@@ -230,13 +230,13 @@ class FoveaGaze:
         )
 
     def show(self, image: Tensor, passed: float) -> None:
-        """Take a frame `(1, 3, H, W)` that a fixation is spent on, and the seconds since the last fixation."""
+        """Set the frame `(1, 3, H, W)` for the next fixation, and the seconds since the last fixation."""
         self.image = image
         self._source.view = self._eye.open(image)
         self._source.passed = passed
 
     def fixate(self) -> Step | None:
-        """Make the next fixation; returns None if none is left."""
+        """Take a look at the next cell; returns None if no cell is left."""
         step = next(self._steps, None)
         if step is not None:
             self.step = step
@@ -244,7 +244,7 @@ class FoveaGaze:
         return step
 
     def look_closely(self) -> _CloserLook:
-        """Look closely at the candidate of the stopping criterion, of which there must be one."""
+        """Take a closer look at the place that the stopping criterion wants to check; there must be one."""
         candidate = self.criterion.candidate
         assert candidate is not None
         assert candidate.cell is not None
@@ -298,7 +298,7 @@ class FoveaEpisode(PictureEpisode[Scanpath]):
         return self._gaze.criterion.decision
 
     def look(self) -> FoveaLook | None:
-        """Fixate the next cell, or look closely at a place that seems to hold the target."""
+        """Fixate the next cell, or take a closer look at a place that seems to hold the target."""
         criterion = self._gaze.criterion
         if criterion.candidate is not None:
             self._look_closely()

@@ -40,7 +40,7 @@ _CONFIRM = 0.65  # probability of the target in the fixated cell at which a sear
 
 
 class HeadAgent(nn.Module):
-    """An agent that looks around in a scene larger than its eye's field of view, and turns its head where that pays.
+    """Agent for scenes larger than the eye's field of view, which turns its head when that is worth the time.
 
     A scene is a `semfov.Panorama`, a `semfov.Flat`, a camera of your own (`semfov.head.PanTiltCamera`), or a picture of
     any common kind, which is a panorama if it is twice as wide as high. The scene has the fields of view and the speeds
@@ -91,7 +91,7 @@ class HeadAgent(nn.Module):
         return cls(eye, search, explore).eval().requires_grad_(False)
 
     def views(self, scene: SceneLike, color: Color = "rgb") -> Views:
-        """List the views and fixations that are possible in a scene.
+        """Make the list of all views and fixations that are possible in a scene.
 
         Args:
             scene: the scene (`semfov.head.open_scene`).
@@ -165,7 +165,7 @@ class HeadAgent(nn.Module):
         *,
         color: Color = "rgb",
     ) -> HeadPath:
-        """Find all objects of a class, of several, or of all: an exploration whose record is about them.
+        """Find all objects of one class, of several, or of every class: an exploration that records these objects.
 
         Args:
             scene: the scene: a `semfov.Panorama`, a `semfov.Flat`, a camera, or a picture (`semfov.head.open_scene`).
@@ -238,7 +238,7 @@ def _first_action(settings: StartSettings) -> int | None:
 
 
 class HeadEpisode(PictureEpisode[HeadPath]):
-    """Looks of an eye in a head that turns in a scene: at the fixations with the largest expected gain per second.
+    """Episode of a head that turns: each look is at the fixation with the largest expected gain per second.
 
     Args:
         agent: the agent.

@@ -1,4 +1,4 @@
-"""The kinds of look of an agent: what each opens of a picture, and the episodes of its tasks.
+"""The kinds of look of an agent: how each opens a picture, and the episode that it runs for each task.
 
 A new kind has its name, words and drawings in `semfov.kinds`, a class here, and the part of the agent that makes its
 episodes (`AgentParts`, `semfov.agent`). Its record is a subclass of `semfov.paths.Record`, which names the kind and has
@@ -65,7 +65,7 @@ class KindOfLook(ABC):
 
     @abstractmethod
     def find_all(self, picture: OpenedPicture, targets: tuple[int, ...], settings: FindSettings) -> Record:
-        """Find all objects of classes 1..K, or with none of all classes (`ActivePerception.find_all`)."""
+        """Find all objects of the given classes (of every class if none is given; `ActivePerception.find_all`)."""
 
     @abstractmethod
     def explore(self, picture: OpenedPicture, settings: ExploreSettings) -> Record:
@@ -141,7 +141,7 @@ class WindowKind(KindOfLook):
 
 
 class HeadKind(KindOfLook):
-    """Looks of an eye in a head that turns in a scene."""
+    """Looks of an eye in a head that turns to parts of a scene."""
 
     kind = HEAD
 

@@ -36,7 +36,7 @@ PictureLike = ImageLike | LargePicture | World | PanTiltCamera
 
 
 class OpenedPicture:
-    """A photograph, a large picture or a scene; what a kind of look needs of it is read when it is asked for.
+    """A photograph, a large picture or a scene, read only when a kind of look needs its pixels.
 
     Args:
         source: the picture.
@@ -68,11 +68,11 @@ class OpenedPicture:
     def of(
         cls, source: "PictureLike | Self", color: Color = "rgb", white: White | None = None, bands: ChosenBands = None
     ) -> Self:
-        """Open a picture of any kind; one that is open stays as it is."""
+        """Open a picture of any kind; an `OpenedPicture` is returned unchanged."""
         return source if isinstance(source, cls) else cls(cast(PictureLike, source), color, white, bands)
 
     def named(self, record: Record) -> Record:
-        """Name the file of the picture in a record that was just made of it."""
+        """Write the file name of the picture into a record of this picture."""
         # A copy would make what a record makes when it is read.
         object.__setattr__(record, "source", self.path)
         return record
@@ -138,7 +138,7 @@ class OpenedPicture:
         return as_image(self._all_bytes(), like=like, argument="picture")[None]
 
     def pixels(self, like: Tensor) -> Tensor:
-        """Read the pixels for a fovea, as `image`; `(1, 3, H, W)` of bytes where floats of all would take too much."""
+        """Read the pixels `(1, 3, H, W)` for a fovea, as bytes if floats would take too much memory."""
         if self.scene or math.prod(self._size()) <= MOST_FLOATS:
             return self.image(like)
         return self._all_bytes()[None]
@@ -151,7 +151,7 @@ class OpenedPicture:
 
     @property
     def is_panorama(self) -> bool:
-        """Whether it is a `Panorama` with its picture."""
+        """Whether the picture is a `Panorama` that was given with its pixels."""
         return isinstance(self.source, Panorama) and self.source.image() is not None
 
     def whole(self, like: Tensor) -> Tensor:
@@ -171,7 +171,7 @@ class OpenedPicture:
         return around.to(like)[None] if isinstance(around, Tensor) else self.image(like)
 
     def viewed(self, like: Tensor, *, panorama: bool = False) -> tuple[Tensor, tuple[int, int]]:
-        """Read the pixels that a prediction of gaze needs of a flat picture, or of a panorama.
+        """Read the pixels of a flat picture or a panorama for a prediction of gaze.
 
         A large picture is reduced as it is read: at its full size it would take gigabytes as floats.
 
@@ -218,13 +218,13 @@ class OpenedPicture:
 
     @cached_property
     def large(self) -> LargePicture:
-        """The picture for windows."""
+        """The picture in the form in which windows are cut from it."""
         source = cast(ImageLike | LargePicture, self.source)
         return open_large(source, color=self.color, white=self.white, bands=self.bands)
 
     @cached_property
     def world(self) -> World:
-        """The scene for a head."""
+        """The scene in which a head turns."""
         shows_chosen_values = self.white is not None or self.bands is not None
         return open_scene(self.large if shows_chosen_values else self.source, self.color)
 
@@ -239,7 +239,7 @@ def _names_several(source: object) -> bool:
 
 
 def check_order(picture: object, target: object, classes: Sequence[str]) -> None:
-    """Raise `InputError` where a class stands in the place of the picture, and what is none in that of the class.
+    """Raise `InputError` if the arguments picture and class seem to be swapped.
 
     Args:
         picture: the argument `picture` of a method of the agent.

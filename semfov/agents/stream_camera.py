@@ -13,7 +13,7 @@ from semfov.zoom.eye import WindowView
 
 
 class StreamCamera:
-    """How the camera moves between frames: by the poses that are given, or estimated from the frames.
+    """The motion of the camera between frames, from given poses, or estimated from the frames.
 
     The first frame decides: with a pose there is one of each frame (`_has_poses`), and without one `_estimate` is made,
     where the camera is followed. Either way `flow` follows objects. It reads all of a frame, so that with poses it is
@@ -37,11 +37,11 @@ class StreamCamera:
 
     @property
     def is_followed(self) -> bool:
-        """Whether its motion is known at all, from the first frame on."""
+        """Whether the motion of the camera is given or estimated at all."""
         return self._estimate is not None or self._has_poses
 
     def step(self, view: WindowView, pose: Motion | ArrayLike | None) -> CameraStep | None:
-        """Take the next frame, with its pose if that is known; returns the motion since the frame before, if it is."""
+        """Take the next frame, with its pose if known, and return the motion since the last frame, if known."""
         if self._is_first:
             self._begin(view, is_pose_known=pose is not None)
         self._is_first = False

@@ -1,4 +1,4 @@
-"""Episodes of looks at windows: of a picture, of the frames of a stream, or at windows that are given.
+"""Episodes of looks at windows of a picture, of the frames of a stream, or at a given list of windows.
 
 `WindowTask` says what is looked for, and with what. `WindowSession` looks at the windows of one source: it chooses
 them, makes closer looks, and decides; the objects are merged when a record is read (`semfov.agents.window_objects`).
@@ -55,12 +55,12 @@ NEW_OBJECTS = 0.01  # default for the least number of new objects that a look mu
 
 @dataclass(frozen=True)
 class WindowTask:
-    """What windows are looked at for, and with what.
+    """The goal of looks at windows, and the fitted models and settings for reaching it.
 
     Attributes:
         goal: what is looked for.
-        evidence: predicts from a look what closer looks will find; None looks at slices in the order of the overview's
-            scores, and then nothing is `absent`.
+        evidence: predicts from a look how many objects smaller windows show; None looks at slices in the order of the
+            overview's scores, and then nothing is `absent`.
         decisions: settings of the decision of a search.
         min_gain: an exploration ends when no look is expected to find more new objects than this; None for the usual
             number. In a photograph, and without evidence, all slices are looked at, and it means nothing.
@@ -85,7 +85,7 @@ class WindowTask:
             Prior.of(self.decisions.prior, None)  # without evidence there is no probability
 
     def takes_slices(self, lattice: Lattice) -> bool:
-        """Whether a picture is looked at by slices, in the order of the overview's scores: not chosen by a belief."""
+        """Whether the agent looks at slices, ordered by the overview's scores, because no belief chooses windows."""
         return self.evidence is None or (lattice.levels == 1 and not self.goal.searches)
 
 
@@ -188,7 +188,7 @@ class WindowSession:
         return value_of_windows(self.tracker.tracks, self.tracker.model, self.source.lattice, level)
 
     def look(self) -> KeptLook | None:
-        """Look at the next window, or closely at a place that seems to hold the target; None if no window is left."""
+        """Look at the next window, or take a closer look at a likely place; returns None if no window is left."""
         if self.forgetting is not None:
             self._closer_looks = [look for look in self._closer_looks if self._counts(look)]
         if self.decisions.candidate is not None:
@@ -225,7 +225,7 @@ class WindowSession:
             self.tracker.see(seen_by(look, self.source.lattice, self.task.goal.sought))
 
     def follow(self, camera: CameraStep) -> None:
-        """Carry closer looks along with the camera, or set them aside where a frame fits none before."""
+        """Move the places of closer looks with the camera, or set them aside if the frame matches no earlier one."""
         if self.decisions.candidate is not None and self.step is not None:
             self.step.choose_anew()  # a closer look is due in this frame, and the choice is for one after it
         carry = partial(carry_along, lattice=self.source.lattice)
@@ -234,7 +234,7 @@ class WindowSession:
 
     @property
     def next_window(self) -> Window:
-        """The window of the next look; there must have been one look."""
+        """The window of the next look, known after the first look."""
         candidate = self.decisions.candidate
         if candidate is not None:
             return closer_window(self.source.lattice, candidate.box, self._close_window)
@@ -243,12 +243,12 @@ class WindowSession:
 
     @property
     def belief(self) -> ZoomBelief | None:
-        """The belief after the last look; None without evidence, and before the first look."""
+        """The belief after the last look; None before the first look, and without fitted models."""
         return None if self.step is None else self.step.belief
 
     @property
     def kept_looks(self) -> list[KeptLook]:
-        """The looks that count and show some of the present frame, in their order."""
+        """The looks that have not been forgotten and show part of the present frame, in temporal order."""
         in_view = [look for look in (*self._chosen_looks, *self._closer_looks) if look.in_view]
         return sorted(in_view, key=lambda look: look.number)
 
@@ -258,7 +258,7 @@ class WindowSession:
         return () if self.step is None else self.step.kept_looks
 
     def record_fields(self, looks: Sequence[LookAtWindow]) -> Values:
-        """Collect what the record of a picture and that of a frame have alike.
+        """Collect the fields that the records of a picture and of a frame have in common.
 
         Args:
             looks: the looks that count, in the order of `kept_looks`.
@@ -288,7 +288,7 @@ class WindowSession:
 
     @property
     def tracks(self) -> Tracks:
-        """The objects that are tracked; none in a picture, and without evidence."""
+        """The tracked objects; empty in a still picture, and without fitted models."""
         return Tracks.none() if self.tracker is None else self.tracker.tracks
 
     @property
@@ -379,7 +379,7 @@ class WindowEpisode(_WindowsOfPicture):
 
     @torch.inference_mode()
     def look(self) -> LookAtWindow | None:
-        """Look at the next window, or closely at a place that seems to hold the target."""
+        """Look at the next window, or take a closer look at a place that seems to hold the target."""
         look = self.session.look()
         if look is None:
             return None
@@ -418,7 +418,7 @@ class WindowEpisode(_WindowsOfPicture):
 
 
 class GivenWindows(_WindowsOfPicture):
-    """Looks at the windows that are given, the first of which is the overview; nothing is decided.
+    """Looks at a given list of windows, which begins with the whole picture; there is no decision.
 
     Args:
         goal: what is looked for.
@@ -444,7 +444,7 @@ class GivenWindows(_WindowsOfPicture):
 
     @torch.inference_mode()
     def look(self, window: Window | None = None) -> LookAtWindow:
-        """Look at a window; None for the overview, and for the window of the look before."""
+        """Look at a window; None stands for the whole picture, and later for the window of the last look."""
         self._next = window or self._next
         look = self.session.look()
         assert look is not None
@@ -458,12 +458,12 @@ class GivenWindows(_WindowsOfPicture):
 
 
 class WindowStream(StreamEpisode[WindowMoment]):
-    r"""Looks at windows of the frames of a stream, one or more at each frame.
+    r"""Looks at windows of the frames of a stream, one or more windows in each frame.
 
     A look counts for :math:`\ln 2 / r` seconds, with the rate r, or until the next look at the same window
     (`semfov.zoom.episode.look_by_look`), and what a later look has shown as closely replaces what earlier ones did.
-    What looks showed is carried along with a camera that moves. With rate 0 frames of a still picture give the looks
-    and the objects of an episode of the picture up to its end.
+    If the camera moves, earlier looks and their detections move with the scene. With rate 0, frames of a still picture
+    give the same looks and objects as an episode of the picture, up to its end.
 
     Args:
         task: what is looked for.
@@ -497,7 +497,7 @@ class WindowStream(StreamEpisode[WindowMoment]):
 
     @property
     def looks(self) -> tuple[LookAtWindow, ...]:
-        """The looks that count at the present frame, where they lie in it."""
+        """The looks that have not been forgotten, at their places in the present frame."""
         return () if self._moment is None else self._moment.looks
 
     @property

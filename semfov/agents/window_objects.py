@@ -1,4 +1,4 @@
-"""The objects of the record of looks at windows, merged when they are first asked for."""
+"""Objects merged from the detections in all windows, computed when the record's objects are first read."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -22,7 +22,7 @@ from semfov.zoom.objects import detected_boxes, merge, probable_objects, without
 
 @dataclass(frozen=True)
 class MergedLooks:
-    """The objects of looks, merged once, when they are first asked for: most records of a stream are never asked.
+    """Objects merged from looks when they are first read; in a stream most are never read.
 
     It holds nothing that a later look or frame changes, and merges in the modes of PyTorch in which it was made.
 
@@ -53,7 +53,7 @@ class MergedLooks:
         return self._merged[0]
 
     def unseen(self) -> tuple[float, float] | None:
-        """Estimate mean and variance of how many more there are; None where that is not known."""
+        """Estimate mean and variance of the number of objects not yet seen; None if it cannot be estimated."""
         return self._merged[1]
 
     @cached_property
@@ -82,7 +82,7 @@ class MergedLooks:
 
 
 def seen_by(look: KeptLook, lattice: Lattice, sought: Sequence[int]) -> Seen:
-    """Take what a look shows of objects of some classes, for a tracker.
+    """Select the detections of some classes in a look, for a tracker.
 
     Args:
         look: the look, as it was taken at the present frame.

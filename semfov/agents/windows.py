@@ -26,14 +26,14 @@ _Picture = LargePicture | ImageLike
 
 
 def knows_photographs(evidence: GlimpseEvidence | None) -> bool:
-    """Tell whether there is evidence, and for photographs, too."""
+    """Tell whether the fitted model (`GlimpseEvidence`) is there and also covers photographs."""
     return evidence is not None and evidence.photograph is not None
 
 
 def window_eye(
     detector: Detector, evidence: GlimpseEvidence | None, *, finest: float = 1.0, cut: Cut = "keep"
 ) -> WindowEye:
-    """Make the eye of a detector that shows it windows as in the fit of the evidence.
+    """Make the eye that shows windows to a detector in the same way as in the fit of its models.
 
     Args:
         detector: any detector.
@@ -48,7 +48,7 @@ def window_eye(
 
 
 class ZoomAgent(nn.Module):
-    """Search and explore pictures that are larger than the detector's input.
+    """Agent that searches and explores pictures larger than the detector's input, by looks at windows.
 
     Each look is a window at a magnification and costs one pass of the detector. The agent chooses the window in which
     it expects to find most. Without evidence, it looks at slices after the overview, in the order of the overview's
@@ -57,7 +57,7 @@ class ZoomAgent(nn.Module):
 
     Args:
         eye: resamples a window and detects in it.
-        evidence: predicts from a look what closer looks will find; None for slices.
+        evidence: predicts from a look how many objects smaller windows show; None for slices.
         photographs: whether to look through windows at photographs, too, if there is no evidence for them.
 
     Attributes:
@@ -90,12 +90,12 @@ class ZoomAgent(nn.Module):
 
     @property
     def suits_photographs(self) -> bool:
-        """Whether a photograph is looked at by windows: if the evidence knows photographs, or if that was asked for."""
+        """Whether windows are used in photographs, too: if the models were fitted to them, or by request."""
         return self._photographs or knows_photographs(self.evidence)
 
     @classmethod
     def recommended(cls, name: str = "yolox-nano", *, finest: float = 1.0, cut: Cut = "keep", **options: Any) -> Self:
-        """Create the agent with the evidence that is shipped for a detector.
+        """Create the agent with the model `GlimpseEvidence` that is shipped for a detector.
 
         Args:
             name: name of the detector.
@@ -118,7 +118,7 @@ class ZoomAgent(nn.Module):
     def search(self, picture: _Picture, target: str | int, settings: SearchSettings | None = None) -> ZoomPath:
         """Search for one object of a class and decide whether the picture holds one.
 
-        The recommended agent looks closely at places that seem to hold the class before it says `found`
+        The recommended agent enlarges places that seem to hold the class before it says `found`
         (`semfov.zoom.closer`); with evidence that has no thresholds of places it does not. Without evidence the class
         is found at a detection with a score of at least `confirm` (None: 0.5).
 
@@ -197,7 +197,7 @@ class ZoomAgent(nn.Module):
         ).run()
 
     def task(self, target: int | None = None, targets: tuple[int, ...] = (), **settings: Any) -> WindowTask:
-        """Say what is looked for, with the evidence of the agent.
+        """Make the task from its goal and the fitted models of the agent.
 
         Args:
             target: class 1..K to search for; None finds all objects.
@@ -214,7 +214,7 @@ class ZoomAgent(nn.Module):
         return WindowTask(goal, evidence, detector=detector.name, usual_score=detector.score_threshold, **settings)
 
     def episode(self, picture: _Picture, task: WindowTask, limits: EpisodeLimits | None = None) -> WindowEpisode:
-        """Make the episode of a picture.
+        """Make the episode of looks at windows of a picture.
 
         Args:
             picture: a file, another picture of any common kind (`semfov.as_image`), or a `LargePicture`.

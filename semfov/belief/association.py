@@ -43,7 +43,7 @@ def one_of(ratio: Tensor, weight: Tensor, miss: Tensor) -> Tensor:
 
 
 def refuted(weight: Tensor, covered: Tensor, visited: Tensor, share: Tensor) -> Tensor:
-    r"""Lower the weights of detections after cells were fixated that do not hold the target.
+    r"""Lower the weights of detections that cover fixated cells, which do not hold the target.
 
     .. math:: w_l(x) \leftarrow w_l(x) \, (1 - \rho \max_{f} c_l(f))
 

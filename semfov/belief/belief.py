@@ -58,7 +58,7 @@ class Belief(OtherWords, ABC):
 
     @abstractmethod
     def probability(self, target: int | Tensor) -> Tensor:
-        """Give the probability that each cell holds the target, given all looks.
+        """Return the probability that each cell holds the target, given all looks.
 
         Args:
             target: class 1..K, or a tensor `(B,)` with one class for each episode. A belief about a single target
@@ -69,7 +69,7 @@ class Belief(OtherWords, ABC):
         """
 
     def chance(self, target: int | Tensor) -> Tensor:
-        """Give the probability that each cell holds the target, given that no fixated cell holds it.
+        """Return the probability that each cell holds the target, given that no fixated cell holds it.
 
         This is the case while a search continues. The base class returns `probability`.
 
@@ -82,7 +82,7 @@ class Belief(OtherWords, ABC):
         return self.probability(target)
 
     def presence(self, target: int | Tensor) -> Tensor:
-        """Give the probability that the target is anywhere in the image.
+        """Return the probability that the target is anywhere in the image.
 
         The base class returns a lower bound: the probability of the most probable cell.
 
@@ -95,7 +95,7 @@ class Belief(OtherWords, ABC):
         return self.probability(target).amax(-1)
 
     def class_probabilities(self) -> Tensor:
-        """Give the probability of every class in every cell.
+        """Return the probability of every class in every cell.
 
         Returns:
             `(B, X·Y, K+1)`, background first.
@@ -204,11 +204,11 @@ class DirichletBelief(Belief):
         return dirichlet.mean(self.beta)
 
     def class_probabilities(self) -> Tensor:
-        """Give the posterior of every class, `(B, X·Y, K+1)`."""
+        """Return the posterior of every class, `(B, X·Y, K+1)`."""
         return self.probabilities
 
     def probability(self, target: int | Tensor) -> Tensor:
-        """Give the posterior of the target class in each cell, `(B, X·Y)`."""
+        """Return the posterior of the target class in each cell, `(B, X·Y)`."""
         return pick(self.beta, target) / self.beta.sum(-1)
 
 
@@ -223,7 +223,7 @@ def dirichlet_belief(belief: Belief) -> DirichletBelief:
 
 
 def pick(values: Tensor, target: int | Tensor) -> Tensor:
-    """Take the values of one class.
+    """Select the values of one class.
 
     Args:
         values: `(B, ..., K+1)`.
@@ -253,7 +253,7 @@ def pick(values: Tensor, target: int | Tensor) -> Tensor:
 
 
 def one_by_one(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """Apply a function to each row alone, because rounding depends on the batch; an accelerator takes many rows.
+    """Apply a function row by row, because rounding depends on the batch; on an accelerator to many rows.
 
     Args:
         function: maps tensors `(b, ...)` to one tensor `(b, ...)`.

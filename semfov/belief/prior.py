@@ -1,4 +1,4 @@
-"""How often the target is there: probabilities for another share of searches than that of the fit.
+"""Priors of searches: change probabilities to another share of present targets than in the fit.
 
 Where the `prior` of a search changes its probabilities, and where the share of the fit is kept:
 
@@ -38,7 +38,7 @@ _Odds = TypeVar("_Odds", float, Tensor)
 
 
 def with_prior(logit: _Odds, prior: float, fitted: float) -> _Odds:
-    r"""Change log odds from the share of searches that they were fitted with to another one.
+    r"""Change log odds from the share of present targets in their fit to another share.
 
     .. math:: \operatorname{logit} P' = \operatorname{logit} P + \operatorname{logit} \pi
               - \operatorname{logit} \pi_{\mathrm{fit}}
@@ -61,7 +61,7 @@ def with_prior(logit: _Odds, prior: float, fitted: float) -> _Odds:
 
 @dataclass(frozen=True)
 class Prior:
-    """The share of the searches whose target is there, and that share in the searches of the fit.
+    """The assumed share of searches with a present target, and the same share in the fit.
 
     Calls change a probability of presence, a float or a tensor (`with_prior`). The same shares change nothing.
 
@@ -80,7 +80,7 @@ class Prior:
 
     @classmethod
     def of(cls, prior: PriorLike, fitted: float | None, usual: float | None = None) -> Self:
-        """Compare a share with that of the fit.
+        """Make a prior from an assumed share and the share in the fit.
 
         Args:
             prior: share of the searches whose target is there; None for one half, `fit` for that of the fit. Models
@@ -107,12 +107,12 @@ class Prior:
 
     @property
     def assumed(self) -> float | None:
-        """Share of the searches whose target is there, which the probabilities assume; None if it is not known."""
+        """Share of searches with a present target that the probabilities assume; None if unknown."""
         return self.share if self.known else None
 
     @property
     def changes_nothing(self) -> bool:
-        """True if the shares are the same."""
+        """Whether the assumed share equals the share in the fit."""
         return self.share == self.fitted
 
     @property
@@ -131,7 +131,7 @@ class Prior:
         return _changed(self, presence)
 
     def at_place(self, place: _Odds, presence: _Odds) -> _Odds:
-        r"""Change the probability of a place, whose share of that of the picture stays.
+        r"""Change the probability of a place in proportion to the probability of the picture.
 
         .. math:: P'(\text{place}) = P(\text{place}) \frac{P'}{P}
 

@@ -1,4 +1,4 @@
-"""Verification: what a closer look at a place says about the target there."""
+"""Verification: the probability of a target at a place after a closer look at the place."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -79,7 +79,7 @@ class Verification(DecidingModule, PretrainedForEye):
             return self.linear(features.to(self.linear.weight))
 
     def check_searching(self, searching: FovealObservationModel) -> None:
-        """Check that it was fitted to probabilities of cells such as those of a search.
+        """Check that the model was fitted to the same kind of cell probabilities as a search has.
 
         Args:
             searching: the observation model of the search.
@@ -111,7 +111,7 @@ class Verification(DecidingModule, PretrainedForEye):
 def closer_features(
     presence: float, cell: float, evidence: float, closer: Detections, box: Tensor, target: int
 ) -> tuple[Tensor, Tensor]:
-    r"""Describe a closer look at a place by seven features, and find the target in it.
+    r"""Compute seven features of a closer look at a place, and the box of the target in it.
 
     Detection m has the largest score times overlap o with the examined box. The features are the logits, within 0.001,
     of: the picture and the cell holding the target, and the evidence there, all before; :math:`s_{mt} o_m`; the highest

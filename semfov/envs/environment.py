@@ -239,7 +239,7 @@ class GazeSearch(GazeEnv):
 
 
 class GazeExplore(GazeEnv):
-    """Explore a scene: look around until the map names the class of every cell with objects.
+    """Explore a scene: look around to find the classes of all cells with objects.
 
     The reward of a step is `find` times the increase of the map's success rate, minus `look_cost`. The success rate is
     the fraction of the cells with objects whose most probable class is that of one of these objects.
@@ -258,7 +258,7 @@ class GazeExplore(GazeEnv):
 
 
 class ZoomEnv(EpisodeEnv):
-    """Search a large picture for an object of a class, or find all objects of it, by windows.
+    """Search a large picture for an object of a class, or find all objects of the class, by looks at windows.
 
     An action is `(x, y, magnification)`, each from 0 to 1: the middle of the window as fractions of width and height,
     and the magnification from the whole picture (0) to the closest look (1), in equal steps of an octave. The eye looks

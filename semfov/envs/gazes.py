@@ -25,7 +25,7 @@ _LOOK_COSTS: dict[Task, float] = {"search": 0.05, "exploration": 0.01}  # cost o
 
 @dataclass(frozen=True)
 class GazeSettings:
-    """What looks cost and bring, and what observations contain.
+    """Settings of rewards and observations: cost of a look, value of a find, parts of an observation.
 
     A new setting is also a keyword of the environments (`semfov.envs.environment`, `semfov.envs.vector`).
 
@@ -64,7 +64,7 @@ _Episode = TypeVar("_Episode", bound=_InScene)
 
 
 class Outcome(NamedTuple):
-    """What a step of n episodes brings.
+    """Results of one step of n episodes: their rewards, and whether they have ended.
 
     Attributes:
         reward: `(n,)`.
@@ -220,7 +220,7 @@ class Gazes(ABC, Generic[_Episode]):
         """Raise `InputError` where a saved state lacks something that these episodes need."""
 
     def restore(self, saved: SavedGazes) -> None:
-        """Go back to a state that `save` gave.
+        """Go back to a state that `save` returned.
 
         Args:
             saved: the state, which can be restored again.
@@ -263,7 +263,7 @@ class Gazes(ABC, Generic[_Episode]):
         return np.ascontiguousarray(channels_last.numpy())
 
     def infos(self, rows: Tensor, *, detections: bool = True) -> Arrays:
-        """Tell what a learner may use beside the observations of some rows.
+        """Make the entries of `info` for some rows.
 
         Args:
             rows: `(n,)`.

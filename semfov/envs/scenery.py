@@ -133,7 +133,7 @@ class _Surroundings(ABC, Generic[_Eye]):
 
 
 class Scenery(_Surroundings[Eye]):
-    """Scenes, an eye and a belief that environments share; the looks at a scene that is entered are kept on disk.
+    """Scenes, an eye and a belief that environments share; looks are stored on disk.
 
     Args:
         looking: the looks at the scenes, and the policy.
@@ -206,7 +206,7 @@ class Scenery(_Surroundings[Eye]):
         return self.eye.open(self.image(scene)[None])
 
     def draw(self, random: np.random.Generator) -> CellEpisode:
-        """Draw an episode: all scenes are equally likely, and so are all episodes of a scene."""
+        """Choose an episode at random: all scenes are equally likely, and all episodes within a scene."""
         # A scene with objects may have no episode, as where a target lies in every cell. One scene at least has some.
         while True:
             episodes = self.episodes(self.scenes[random.integers(len(self.scenes))])

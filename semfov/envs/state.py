@@ -45,7 +45,7 @@ class EnvState:
         return {**vars(self), "scenery": self.scene_key()}
 
     def scene_key(self) -> str:
-        """Tell the key of the scenes, which those that are opened again with the same settings have, too.
+        """Compute the key of the scenes; scenes that are opened with the same settings have the same key.
 
         Returns:
             64 hexadecimal digits.

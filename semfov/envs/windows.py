@@ -41,7 +41,7 @@ class _SavedLooks(NamedTuple):
 
 
 class WindowGaze(Gazes[_WindowEpisode]):
-    """An episode in a large picture, whose first look is the whole picture; one at a time, as it has its own belief.
+    """An episode in a large picture, which begins with a look at the whole picture.
 
     Args:
         scenery: the pictures.
@@ -106,7 +106,7 @@ class WindowGaze(Gazes[_WindowEpisode]):
         return outcome
 
     def planes(self, rows: Tensor) -> NDArray[np.float32]:
-        """Lay out the probability that closer looks find an object, and how closely each place was looked at."""
+        """Make planes of the probability that smaller windows show an object, and of the magnification so far."""
         # Of a number of objects that is Poisson distributed, the probability that it is not 0.
         probability = 1 - torch.exp(-self._expected_objects())  # (1, Y, X)
         closeness = adaptive_max_pool2d(self._closeness(), self.shape)  # (1, Y, X)

@@ -230,7 +230,7 @@ class MosaicFit:
         random.seed(self.config.seed)
 
     def fit_prediction(self, examples: Mapping[str, list[ZoomExample]]) -> GlimpseEvidence:
-        """Fit the numbers of objects of each class that closer looks find; examples by kind."""
+        """Fit the numbers of objects of each class that smaller windows show; examples by kind."""
         self._seed()
         metadata = {**self.eye.settings(), **training_of(self.config, self.mosaics["near"], "judged")}
         model = GlimpseEvidence(len(self.eye.detector.classes), metadata=metadata)
@@ -239,7 +239,7 @@ class MosaicFit:
         return model.eval().requires_grad_(False)
 
     def fit_survey(self, model: GlimpseEvidence, examples: Mapping[str, list[ZoomExample]]) -> list[str]:
-        """Fit the numbers of objects of any class that closer looks find; returns lines of Markdown."""
+        """Fit the numbers of objects of any class that smaller windows show; returns lines of Markdown."""
         self._seed()
         # A new one, since a fit may be repeated with a model that has one.
         survey = Survey(model.classes, foresight=model.survey.foresight)

@@ -1,12 +1,12 @@
-"""Fit evidence by magnification: how many objects, of a class or of any, closer looks find.
+"""Fit models of how many objects, of one class or of any, looks at smaller windows find.
 
-A picture is looked at in windows of all magnifications. Each look is paired with the closer windows inside it, whose
+A picture is looked at in windows of all magnifications. Each look is paired with the smaller windows inside it, whose
 results it should predict:
 
     overview ──────────────────┐ predicts ┌► window, one octave closer ─┐ predicts ┌► window, two octaves closer
     (its gist: scores by cell) ┘          └──── predicts, a step more ──┼──────────┘
 
-A prediction by a closer look builds on that of the overview for the same window (`before`).
+A prediction by a look at a smaller window builds on that of the overview for the same window (`before`).
 """
 
 import random
@@ -32,7 +32,7 @@ _SHOWN_CLASSES = 8  # largest number of classes of a mosaic, shown clearly, whos
 _HINTED_CLASSES = 4  # and that of classes that are only hinted at
 _HINT = 0.02  # score from which on a class is hinted at
 _CLOSER_LOOKS = 2
-"""Closer looks of a mosaic, beside its overview, whose predictions are fitted in one step."""
+"""Looks at smaller windows of a mosaic, beside its overview, whose predictions are fitted in one step."""
 _LEAST_RATE = 1e-6  # keeps logarithms of expected numbers finite
 
 ANY_CLASS = torch.tensor([0])
@@ -56,7 +56,7 @@ class WindowResult(NamedTuple):
 
 
 class _WindowCounts(NamedTuple):
-    """Numbers of new objects that n closer looks of one size found.
+    """Numbers of new objects that n looks at smaller windows of one size found.
 
     Attributes:
         rows: `(n,)`, first row of the outer look's cells that they show.
@@ -70,7 +70,7 @@ class _WindowCounts(NamedTuple):
 
 
 def _is_predicted(look: Gist, window: Window) -> bool:
-    """Tell whether a look predicts a closer one: that inside it, or any if it is an overview."""
+    """Tell whether a look predicts another one: a look at a smaller window inside it, or any after an overview."""
     if look.level == 0:
         return True
     rows, columns = look.scores.shape[:2]
@@ -93,7 +93,7 @@ def _cells_shown(look: Gist, window: Window) -> tuple[int, int, int]:
 
 
 class LookCounts(NamedTuple):
-    """A look, and how many new objects each of the closer looks inside it found.
+    """A look, and how many new objects each look at a smaller window inside it found.
 
     Attributes:
         gist: the look.
@@ -105,7 +105,7 @@ class LookCounts(NamedTuple):
 
     @classmethod
     def of(cls, look: Gist, results: Iterable[WindowResult], classes: Tensor, earlier: Tensor) -> "LookCounts":
-        """Count what the closer looks inside a look find; an overview predicts all.
+        """Count what looks at smaller windows inside a look find; an overview predicts all.
 
         Args:
             look: the look.
@@ -189,7 +189,7 @@ def _rates_before(first: Gist, log_rates: Tensor, look: Gist) -> Tensor:
 
 
 class ZoomExample(NamedTuple):
-    """A picture: its overview and its closer looks, each with the numbers of new objects that looks inside it found.
+    """A picture: its overview and smaller windows, each with the numbers of new objects that looks inside it found.
 
     Attributes:
         overview: the look at the whole.
@@ -282,7 +282,7 @@ class ZoomExample(NamedTuple):
         return losses
 
     def loss(self, model: Rates, targets: Tensor) -> Tensor:
-        """Average the losses of the overview and of a few closer looks, drawn at random."""
+        """Average the losses of the overview and of a few looks at smaller windows, drawn at random."""
         closer = random.sample(self.closer, min(_CLOSER_LOOKS, len(self.closer)))
         return torch.stack(self.losses(model, targets, closer)).mean()
 
@@ -293,7 +293,7 @@ def _drawn(values: Tensor, most: int) -> Tensor:
 
 
 def fit_rates(model: GlimpseEvidence, examples: Sequence[ZoomExample], steps: int, batch: int = 4) -> None:
-    """Fit the expected number of objects of a class that closer looks find, by its Poisson likelihood.
+    """Fit the expected number of objects of a class that smaller windows show, by its Poisson likelihood.
 
     Args:
         model: evidence by magnification.
@@ -307,7 +307,7 @@ def fit_rates(model: GlimpseEvidence, examples: Sequence[ZoomExample], steps: in
 
 
 def fit_survey(survey: Survey, examples: Sequence[ZoomExample], steps: int, batch: int = 8) -> None:
-    """Fit the expected number of objects of any class that closer looks find, by its Poisson likelihood.
+    """Fit the expected number of objects of any class that smaller windows show, by its Poisson likelihood.
 
     Args:
         survey: predicts the numbers of objects of any class.
@@ -333,7 +333,7 @@ def _loss_of_batch(
 
 @torch.no_grad()
 def judge_windows(model: GlimpseEvidence, examples: Sequence[ZoomExample]) -> dict[str, float]:
-    """Evaluate the expected number of objects of a class that closer looks find, on held-out pictures.
+    """Evaluate the expected number of objects of a class that smaller windows show, on held-out pictures.
 
     Args:
         model: evidence by magnification.

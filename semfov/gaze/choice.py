@@ -1,4 +1,4 @@
-"""How the next fixation is chosen from the acquisition values of the cells: the best cell, or a draw."""
+"""Rules that choose the next fixation from the acquisition values of cells: the best cell, or a random one."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -14,7 +14,7 @@ _Noise = Callable[[int, Tensor], Tensor]
 
 
 class Choice(ABC):
-    """Base of all ways to choose the next fixation.
+    """Base of all rules that choose the next fixation.
 
     A subclass implements `__call__`, which `semfov.rollout` calls once for every gaze shift.
 
@@ -57,7 +57,7 @@ class Greedy(Choice):
 
 
 class Softmax(Choice):
-    r"""A noisy choice: draw a cell not visited with probability :math:`P(x) \propto e^{b \, a(x)}`.
+    r"""A noisy choice: sample a cell not visited with probability :math:`P(x) \propto e^{b \, a(x)}`.
 
     With b = 0 all cells are equally likely. The larger b, the closer the choice is to `Greedy`. Cells are drawn as by
     `soft_fixation`, and the draw depends on the values and the random numbers alone. No gradient flows through it.
@@ -89,7 +89,7 @@ class Softmax(Choice):
 
 
 class Relaxed(Choice):
-    """Draw a cell by Gumbel-softmax, so that gradients flow through the choice (`soft_fixation`).
+    """Sample a cell by Gumbel-softmax, so that gradients flow through the choice (`soft_fixation`).
 
     Args:
         noise: random numbers to draw with.
@@ -124,7 +124,7 @@ class Relaxed(Choice):
 
 
 class Given(Choice):
-    """Follow a scanpath that is given.
+    """Choose the cells of a given scanpath.
 
     Args:
         cells: `(B, n)`, the cells that each episode fixates, the start first.
@@ -190,7 +190,7 @@ def soft_fixation(
     temperature: float = 1.0,
     hard: bool = True,
 ) -> tuple[Tensor, Tensor]:
-    r"""Draw a fixation by Gumbel-softmax over the cells not visited (Jang, Gu and Poole, 2017).
+    r"""Sample a fixation by Gumbel-softmax over the cells not visited (Jang, Gu and Poole, 2017).
 
     .. math:: y = \mathrm{softmax}\left(\frac{\ell - \ln(-\ln u)}{\tau}\right), \quad
               x^* = \arg\max_x y(x), \quad \tilde f = \sum_x y(x) \, c(x)
@@ -239,10 +239,10 @@ def soft_fixation(
 
 
 def drawn_from(noise: Tensor) -> _Noise:
-    """Take random numbers from a table `(B, shifts, X·Y)`, so that an episode repeats."""
+    """Read random numbers from a table `(B, shifts, X·Y)`, so that an episode can be repeated."""
     return lambda shift, episodes: noise[episodes, shift]
 
 
 def drawn_by(generator: torch.Generator, cells: int, like: Tensor) -> _Noise:
-    """Draw random numbers from a generator as they are needed, with the dtype and device of `like`."""
+    """Sample random numbers from a generator when needed, with the dtype and device of `like`."""
     return lambda shift, episodes: torch.rand(len(episodes), cells, generator=generator).to(like)

@@ -1,4 +1,4 @@
-"""Policies: where to look, by an acquisition function, for any target on any grid."""
+"""Policies: they look at the best cell by an acquisition function, for any target and grid."""
 
 from collections.abc import Mapping
 from typing import get_args
@@ -89,11 +89,11 @@ class Policy(nn.Module):
 
     @property
     def name(self) -> str:
-        """Name of the acquisition function, or of its class where it has none."""
+        """Name of the acquisition function, or of its class if the function has no name."""
         return self.function.name or self.function.__name__
 
     def extra_repr(self) -> str:
-        """Write the name."""
+        """Return the policy's name for `repr`."""
         return repr(self.name)
 
     def forward(self, target: int | Tensor | None, grid: Grid) -> AcquisitionFunction:

@@ -1,4 +1,4 @@
-"""The choice of the next fixation by people who view a picture freely."""
+"""A choice of the next fixation that imitates people who view a picture freely."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,7 @@ from semfov.gaze.saliency import FixationDensity, cell_saliency
 
 
 class Viewer(Choice):
-    """Draw each fixation from the density of people's next fixations, after the fixations so far.
+    """Sample each fixation from the predicted density of people's next fixations, given the fixations so far.
 
     A cell is drawn with the probability that the density has in it, among the cells not visited, as for any policy.
     The values of the acquisition function do not matter.

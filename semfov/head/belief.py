@@ -61,7 +61,7 @@ class SceneBelief(Belief):
 
     @property
     def about_all(self) -> bool:
-        """Whether it is a belief about all classes, and not about one target."""
+        """Whether the belief is about all classes, rather than one target."""
         return self.values.shape[-1] > 2
 
     def probability(self, target: int | Tensor) -> Tensor:
@@ -150,7 +150,7 @@ class SceneObserver(Observer):
         return nearest, (nearest <= closest_so_far) | is_owner
 
     def fade(self, belief: Belief, look: Evidence, keep: float, visited: Tensor) -> SceneBelief:
-        """Discount the evidence of the looks so far; all cells return towards what is believed of an unseen one.
+        """Discount the evidence of the looks so far; all cells move towards the belief of an unseen cell.
 
         Args:
             belief: the belief after the looks so far.

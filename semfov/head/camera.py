@@ -23,7 +23,7 @@ _DRAWN = 1280  # pixels across the panorama of its frames
 
 @dataclass(frozen=True)
 class CameraFrame:
-    """A frame of a camera that tells where it was really taken.
+    """A frame of a camera, with the direction in which it was really taken.
 
     Attributes:
         image: the frame, of any common kind (`semfov.as_image`).
@@ -40,7 +40,7 @@ class CameraFrame:
 
 
 class PanTiltCamera(Protocol):
-    """A camera that turns. A class that derives from it needs `look_at` and `size`, and the attributes that differ.
+    """Base of cameras that turn; a subclass needs `look_at`, `size`, and attributes that differ from the defaults.
 
     Angles are in degrees. Pan is positive to the right and tilt is positive upwards; (0, 0) is straight ahead. The lens
     is taken to be without distortion.

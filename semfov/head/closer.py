@@ -1,4 +1,4 @@
-"""Closer looks of a head that zooms: places that a narrower field of view would show better."""
+"""Looks of a camera that zooms in: places that a narrower field of view would show better."""
 
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ class _Place(NamedTuple):
 
 
 class CloserLookOffers:
-    """Offers closer looks at the boxes of the looks so far, a few for each look.
+    """Offers looks with a narrower field of view at detected boxes, a few for each look.
 
     The narrowest field of view that is three times as wide as a box shows it, if no look at its cell of the scene had
     one as narrow.
@@ -91,7 +91,7 @@ class CloserLookOffers:
         return min(wide_enough, default=self.views.fields[-1])
 
     def values(self, belief: SceneBelief, here: int) -> Tensor:
-        """Value the closer looks that are offered after a look; their poses are added to the views.
+        """Compute the values of the offered looks with a narrower field of view, and add their poses to the views.
 
         Args:
             belief: the belief over the scene.

@@ -52,7 +52,7 @@ class _HeadLooks(Looks):
 
 
 def live(eye: Eye, views: Views) -> Detect:
-    """Detect with an eye on request; detections in a frame from another pose are moved to the view that was asked for.
+    """Make a function that looks with an eye; detections from another pose are moved to the requested view.
 
     Args:
         eye: the eye.
@@ -140,7 +140,7 @@ def look_around(
     min_gain: float = 0.0,
     seed: int | Sequence[int] = 0,
 ) -> Iterator[HeadStep]:
-    """Run an episode look by look; the caller may stop at any time. What was seen fades at the rate of the scene.
+    """Run an episode look by look; the caller may stop at any time.
 
     Args:
         views: poses and fixations.

@@ -26,7 +26,7 @@ OUT = -1e6  # value of actions that must not be chosen
 
 
 def was_fixated(belief: SceneBelief, world: World) -> Tensor:
-    """Tell which cells a search has fixated, or a neighbour that is as probable, which shows the same object.
+    """Find the cells that were fixated, or that lie beside a fixated cell that is at least as probable.
 
     Args:
         belief: about a target.
@@ -45,7 +45,7 @@ def was_fixated(belief: SceneBelief, world: World) -> Tensor:
 
 
 class LookGain(nn.Module):
-    """Base of the expected gains `(A,)` of looks, called with a belief, the pose `here`, and the `poses` to value."""
+    """Base of modules that compute the expected gains `(A,)` of looks from a belief and a pose."""
 
     def __init__(self, views: Views) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ class LookGain(nn.Module):
         self._acuity = [views.acuity(shown.distances) for shown in views.shown[: views.lattice]]
 
     def closer(self, belief: SceneBelief, cells: Tensor) -> Tensor:
-        """Compute the expected gain of closer looks at places, with a narrower field of view.
+        """Compute the expected gain of looks at places with a narrower field of view.
 
         Args:
             belief: the belief over the scene.
@@ -198,7 +198,7 @@ class ExploreGain(LookGain):
 
 
 class PerSecond(AcquisitionFunction):
-    """Expected gain per second, for movements of the eye and turns of the head alike.
+    """Expected gain per second of a movement of the eye, or of eye and head.
 
     Turns of the head within the dead zone of its speeds are not made.
 

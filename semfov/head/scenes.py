@@ -31,7 +31,7 @@ _RADIANS = {"pan": 2 * math.pi, "tilt": math.pi / 2, "reach": math.pi / 2, "fiel
 
 
 def check_degrees(name: str, angles: Sequence[float]) -> None:
-    """Refuse angles that are no degrees, but look like radians or like shares.
+    """Raise an error for angles that seem to be in radians or fractions instead of degrees.
 
     One rule holds for all: if the largest angle of one kind, its sign aside, is possible in radians and not 0, its unit
     is taken to be another one. Each kind is judged alone, because a driver may mix units.
@@ -160,7 +160,7 @@ def _angle_between(one: Tensor, other: Tensor) -> Tensor:
 
 
 class Sphere(_Scene):
-    """Directions around a perspective camera, without anything to see; D is 3, and the picture equirectangular."""
+    """Base of scenes around a perspective camera: directions in 3 dimensions, without a picture."""
 
     closed = True
 

@@ -83,7 +83,7 @@ class Speeds:
         return torch.where(angle <= reaches_speed, accelerated, cruising)
 
     def makes(self, angle: Tensor) -> Tensor:
-        """Tell which turns of the head are made, those beyond its dead zone; it can always stay.
+        """Tell which turns of the head are possible: no turn, and turns beyond the dead zone.
 
         Args:
             angle: `(...)`, in degrees.

@@ -129,7 +129,7 @@ class Views:
         return self.replace(number, pose)
 
     def replace(self, number: int, pose: Tensor) -> int:
-        """Give the number of a pose that was never looked from to another one.
+        """Replace a pose that was never used by another pose, with the same number.
 
         Args:
             number: of the pose that is replaced.
@@ -170,7 +170,7 @@ class Views:
         return ShownCells(inside.nonzero()[:, 0], shown_points, self._distances(pose, shown_points))
 
     def field_of(self, pose: Tensor) -> float:
-        """Find the field of view of a pose, which has it in the precision of a tensor."""
+        """Find the field of view of a pose, in full precision."""
         return min(self.fields, key=lambda field: abs(field - float(pose[2])))
 
     def __len__(self) -> int:
@@ -179,7 +179,7 @@ class Views:
 
     @cached_property
     def ahead(self) -> int:
-        """Action in the middle of the view nearest to straight ahead, of those that tile the scene."""
+        """Action that fixates the middle of the view nearest to straight ahead."""
         numbers = [number for row in self.tiling for number in row]
         straight_ahead = torch.tensor([0.0, 0.0, self.fields[-1]]).expand(len(numbers), 3)
         turns = self.world.turn(self.poses[numbers], straight_ahead)

@@ -1,4 +1,4 @@
-"""Subcommand check: says what is suspicious in files of fixations."""
+"""Subcommand `check`: reports what is suspicious in files of fixations."""
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -125,7 +125,7 @@ def _shows_pictures(place: Path) -> bool:
 
 
 class FixationReport(NamedTuple):
-    """What is in a file of fixations.
+    """Report about a file of fixations: its contents, and what is suspicious.
 
     Attributes:
         content: what it holds, in a line.
@@ -139,7 +139,7 @@ class FixationReport(NamedTuple):
 
     @property
     def lines(self) -> list[str]:
-        """What is suspicious, a line each, or that nothing is."""
+        """Lines of the report: one for each suspicion, or one that says that there is none."""
         if self.suspicious:
             return [f"suspicious: {line}" for line in self.suspicious]
         not_compared = "" if self.was_compared else "; frames were not compared with pictures (--picture FOLDER)"
@@ -147,7 +147,7 @@ class FixationReport(NamedTuple):
 
 
 def fixation_report(path: Path, options: CheckOptions, keep: Callable[[Path], bool] | None = None) -> FixationReport:
-    """Read one file of fixations, and say what is suspicious.
+    """Read one file of fixations, and report what is suspicious.
 
     Args:
         path: the file.
@@ -197,7 +197,7 @@ class _Reading:
         return _Reading(options)
 
     def report(self, path: Path) -> FixationReport:
-        """Read one file of fixations, and say what is suspicious."""
+        """Read one file of fixations, and report what is suspicious."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what the lines below say
             warnings.filterwarnings("always", message=".*(is not UTF-8|is not read)")  # which they do not say

@@ -1,4 +1,4 @@
-r"""Whether the coordinates of fixations are read rightly, judged by what the pictures show at them.
+r"""Whether the coordinates of fixations were read correctly, judged by what the pictures show there.
 
 People look at what is in a picture, so fixations that are read rightly lie where a model of fixations expects them *in
 that picture*, and fixations that are read wrongly lie elsewhere. Each way to read a file, such as with y upwards, puts
@@ -176,7 +176,7 @@ def content_suspicions(
     densities: Mapping[str, Tensor],
     sizes: Mapping[str, tuple[int, int]],
 ) -> list[str]:
-    """Judge by the content of the pictures whether fixations are read rightly, and if not, how they should be.
+    """Judge by the content of the pictures whether fixations were read correctly, and name the likely error.
 
     Frame, origin and axes, the size at which pictures were shown, their names, and a shift of the calibration are
     tested, for all fixations and for each person. The pictures should differ; ten or more tell much.

@@ -1,4 +1,4 @@
-"""What subcommand check knows of fixations from the pictures in which they were made."""
+"""The part of subcommand `check` that compares fixations with their pictures."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +23,7 @@ _DAMAGED_NAMED = 3  # largest number of damaged pictures that are named
 def suspicions_by_content(
     records: Sequence[Fixations], path_of: Callable[[str], Path], sizes: Mapping[str, tuple[int, int]], *, quiet: bool
 ) -> list[str]:
-    """Compare fixations with where people look in their pictures (`semfov.human.content`).
+    """Compare fixations with the predicted density of fixations in their pictures (`semfov.human.content`).
 
     Args:
         records: the records.
@@ -60,7 +60,7 @@ def suspicions_by_content(
 
 
 def damage_lines(errors: Sequence[SemfovError]) -> list[str]:
-    """Say why pictures cannot be opened, the first of them."""
+    """Make lines that say why the first pictures with an error cannot be opened."""
     more = len(errors) - _DAMAGED_NAMED
     rest = [f"{amount(more, 'more picture')} cannot be opened"] if more > 0 else []
     return [*map(str, errors[:_DAMAGED_NAMED]), *rest]

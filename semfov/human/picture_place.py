@@ -1,4 +1,4 @@
-"""Where pictures lay on the frame of a recording: a box that is moved and resized until fixations fit best."""
+"""Search for the box that pictures covered on the screen of a recording, from the fixations."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -42,7 +42,7 @@ class PicturePlace(NamedTuple):
         return PicturePlace(self.corner + shares * self.sides, self.sides)
 
     def neighbours(self, step: float) -> Iterator["PicturePlace"]:
-        """Go through the boxes that are moved or resized by a step, along one axis; then those resized along both."""
+        """Yield boxes moved or resized by one step along one axis, then boxes resized along both axes."""
         for axis in np.eye(2):
             for change in (-step * axis, step * axis):
                 yield self.moved(change)

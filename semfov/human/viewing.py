@@ -1,4 +1,4 @@
-"""People who view pictures: their fixations, and the maps of the pictures, each looked at once."""
+"""Data of free viewing: people's fixations, and a detector's feature maps of the pictures."""
 
 import math
 from collections import defaultdict
@@ -80,7 +80,7 @@ class ViewingData(Settings):
         return digests
 
     def people(self, number: int) -> dict[str, list[Fixations]]:
-        """Read the scanpaths of more than one fixation of a data set, by picture."""
+        """Read the scanpaths of a data set by picture, without scanpaths of a single fixation."""
         options = {"size": frame_of(self.sizes[number])} if number < len(self.sizes) else {}
         scanpaths = read_fixations(self.fixations[number], **options)
         pictures = by_picture(scanpath for scanpath in scanpaths if len(scanpath) > 1)
@@ -93,7 +93,7 @@ class ViewingData(Settings):
 
 @dataclass(frozen=True)
 class Viewed:
-    """P pictures of one size, and everybody's scanpaths.
+    """P pictures of one size, with the scanpaths of all people in them.
 
     Attributes:
         features: their feature maps `(P, C, h, w)`, in half precision.
@@ -117,7 +117,7 @@ class Viewed:
 
     @cached_property
     def paths(self) -> list[list[Tensor]]:
-        """For each picture the first fixations of each person, `(n, 2)` in pixels of it."""
+        """The first fixations of each person in each picture, `(n, 2)`, in pixels of the picture."""
         return [[*map(_first_points, scanpaths)] for scanpaths in self.people]
 
     def some(self, pictures: Sequence[int]) -> FeatureMaps:
@@ -176,7 +176,7 @@ def _numbers_of_cells(points: Tensor, size: tuple[int, int], cells: tuple[int, i
 
 
 class MapSource(NamedTuple):
-    """What gives the maps of pictures.
+    """Protocol of sources of the feature maps of pictures.
 
     Attributes:
         layers: names of the maps.
@@ -210,7 +210,7 @@ def features_of(detector: Detector, layers: Sequence[str] = ()) -> MapSource:
 
 
 def look(data: ViewingData, source: MapSource) -> list[Viewed]:
-    """Look at all pictures, or read their maps from the cache.
+    """Compute the feature maps of all pictures, or read them from the cache.
 
     Args:
         data: pictures and fixations.
@@ -305,7 +305,7 @@ def _joined(features: Sequence[FeatureMaps]) -> FeatureMaps:
 
 
 class Events(NamedTuple):
-    """E fixations to be predicted, all but the first of a path.
+    """E fixations to be predicted: all fixations of scanpaths but the first ones.
 
     Attributes:
         before: `(E, N, 2)`, the fixations before each, the last one last; NaN where there were fewer.
@@ -338,7 +338,7 @@ class Events(NamedTuple):
 
 
 def log_centre(groups: Sequence[Viewed], pictures: Sequence[Sequence[int]]) -> Tensor:
-    """Compute the log density of all fixations, blurred and mixed with 2 % uniform; all groups count alike.
+    """Compute the log density of all fixations, blurred and mixed with 2 % of a uniform density.
 
     Args:
         groups: pictures of one size each, with everybody's scanpaths.

@@ -61,14 +61,14 @@ class CameraStep(NamedTuple):
 
     @property
     def is_still(self) -> bool:
-        """Whether nothing has moved, and nothing was lost, found again or given up."""
+        """Whether the camera stood still, and no scene was lost, found again or given up."""
         if self.recovered is not None or self.gives_up:
             return False
         return self.motion is not None and self.motion.is_still
 
 
 class KnownPoses:
-    """How the camera moved by poses that are known: of a gimbal, a head, or a robot's odometry.
+    """Motion of a camera from known poses: of a gimbal, a head, or a robot's odometry.
 
     >>> camera = KnownPoses()
     >>> camera.step([[1, 0, 0], [0, 1, 0]]).motion is None
@@ -144,7 +144,7 @@ class _LostScene:
 
 
 class CameraMotion:
-    r"""Estimates how the picture of a scene moved since the last frame, or finds that two frames do not fit together.
+    r"""Estimates the motion from frame to frame, or finds that a frame matches no earlier one.
 
     Corners of a key frame (Shi and Tomasi, 1994) are followed into the present one by pyramidal Lucas–Kanade flow
     (Bouguet, 2001), and a similarity is fitted to them by RANSAC (Fischler and Bolles, 1981); all three are OpenCV's.

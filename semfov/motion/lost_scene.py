@@ -1,4 +1,4 @@
-"""What is known of a scene that the camera lost: kept for some frames, and carried along if it is found again.
+"""Memory of a scene that the camera has lost: kept for some frames, and used if the scene comes back.
 
 What is kept so: looks at windows (`semfov.zoom.episode`, `semfov.agents.window_episode`), candidates and places of
 closer looks (`semfov.decision.candidates`, `semfov.decision.verifier`, `semfov.zoom.closer`), and tracked objects
@@ -16,7 +16,7 @@ _Thing = TypeVar("_Thing")
 
 
 class LostScene(Generic[_Thing]):
-    """What was known of the scene before a disturbance, where it lay in the last frame before that.
+    """What was known of the scene before it was lost, at its places in the last frame that showed it.
 
     Attributes:
         things: what was known; None while the camera has lost no scene that it may find again.
@@ -36,7 +36,7 @@ class LostScene(Generic[_Thing]):
     def follow(
         self, things: list[_Thing], camera: CameraStep, carry: Callable[[list[_Thing], Motion], list[_Thing]]
     ) -> list[_Thing]:
-        """Carry what is known along with the camera, or set it aside, or find it again.
+        """Move what is known with the camera, set it aside if the scene is lost, or restore it.
 
         Args:
             things: what is known of the scene in the last frame.

@@ -90,7 +90,7 @@ class Motion:
 
     @classmethod
     def of(cls, matrix: "Motion | ArrayLike") -> "Motion":
-        """Take a motion, or make one of a matrix as OpenCV gives it.
+        """Make a motion from a matrix in OpenCV's form; a motion is returned unchanged.
 
         Args:
             matrix: a motion, or a `(3, 3)` or `(2, 3)` matrix.
@@ -141,7 +141,7 @@ class Motion:
         return torch.from_numpy(mapped[..., :2] / mapped[..., 2:]).to(points)
 
     def is_ahead(self, points: Tensor) -> Tensor:
-        """Tell which points the camera can see at all: a homography maps what is behind the camera to pixels, too.
+        """Tell which points lie before the camera; a homography also maps points behind it to pixels.
 
         Args:
             points: `(..., 2)`, `(x, y)` in pixels of the first frame.

@@ -403,7 +403,7 @@ class FovealObservationModel(Pretrained):
 
     @property
     def true_cells(self) -> bool:
-        """Whether searches read probabilities of cells that a fit has made true (`Presence.of_cells`)."""
+        """Whether searches use calibrated probabilities of cells (`Presence.of_cells`)."""
         return self.presence is not None and self.presence.centre is not None
 
     def check_compatible(
@@ -479,7 +479,7 @@ class FovealObservationModel(Pretrained):
         return model
 
     def extra_repr(self) -> str:
-        """Write the sizes for the `repr` of the module.
+        """Return the sizes for `repr`.
 
         Returns:
             Numbers of classes and levels, and ε.

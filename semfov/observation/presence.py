@@ -56,7 +56,7 @@ def log_evidence(score: Tensor) -> Tensor:
 
 
 def presence_facts(probability: Tensor, evidence: Tensor) -> Tensor:
-    """Put together what a `Presence` reads of a belief about a class.
+    """Collect the inputs of a `Presence` from a belief about a class.
 
     Args:
         probability: `(..., X·Y)`, of the class in each cell.
@@ -157,7 +157,7 @@ class Presence(DecidingModule):
         return self.offset.to(facts) + exact_product(facts, self.slopes.to(facts))
 
     def detach(self) -> "Presence":
-        """Copy the module with numbers that are constants, through which no gradient flows.
+        """Copy the module with constant parameters, through which no gradient flows.
 
         Returns:
             The copy.
@@ -165,7 +165,7 @@ class Presence(DecidingModule):
         return deepcopy(self).requires_grad_(False)
 
     def of_cells(self, probability: Tensor, footprint: str) -> Tensor:
-        """Make the probabilities of cells true.
+        """Calibrate the probabilities of cells.
 
         Args:
             probability: `(...)`, of the class in each cell.
@@ -185,7 +185,7 @@ class Presence(DecidingModule):
 
 
 def presence_of(tensors: dict[str, Tensor], thresholds: Thresholds | None) -> Presence | None:
-    """Make the `Presence` of the tensors of a file, which may lack it.
+    """Make the `Presence` from the tensors of a file; None if the file has none.
 
     Args:
         tensors: those of the file, by name (`PRESENCE`).

@@ -1,4 +1,4 @@
-"""Thresholds on probabilities at which a search decides, as a model keeps them."""
+"""Thresholds on probabilities at which a search decides, stored in a model."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -80,7 +80,7 @@ def thresholds_of(record: Mapping[str, float] | None) -> Thresholds | None:
 
 
 class DecidingModule(StatedModule):
-    """Base of modules with thresholds at which searches decide, which are in their state.
+    """Base of modules whose state includes thresholds at which searches decide.
 
     Attributes:
         thresholds: the thresholds; None if none were chosen.

@@ -128,7 +128,7 @@ class Record(Conversion):
         return None
 
     def regions(self, index: int = -1) -> Sequence[Region]:
-        """Find the regions of the map of what is where, as an exploration with a fovea makes it.
+        """Find the regions in the map of classes that an exploration with a fovea makes.
 
         Args:
             index: place of the look after which the map is read, from 0; negative ones count from the end.
@@ -366,7 +366,7 @@ class Moment(Record):
     @property
     @abstractmethod
     def next_point(self) -> tuple[float, float]:
-        """`(x, y)` in pixels, the point that the next look is at."""
+        """The point `(x, y)` of the next look, in pixels."""
 
     @property
     def ways(self) -> dict[int, list[tuple[float, float]]]:

@@ -9,7 +9,7 @@ _PANORAMA = 2  # width over height of a panorama of 360° by 180°
 
 
 class Cautions(NamedTuple):
-    """What is known of a picture and of the model that may not suit it.
+    """Facts about a picture for which the gaze model may be wrong.
 
     Attributes:
         size: `(width, height)` of the picture in pixels.
@@ -26,7 +26,7 @@ class Cautions(NamedTuple):
     is_shipped: bool
 
     def words(self) -> str | None:
-        """Say all that is known against the prediction; None for nothing."""
+        """Describe all reasons to doubt the prediction; None if there is none."""
         return "; ".join(self._all()) or None
 
     def _all(self) -> Iterator[str]:

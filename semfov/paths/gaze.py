@@ -255,7 +255,7 @@ class GazePrediction(OtherWords):
         return [Fixations(self.name, f"viewer {n}", path.double().numpy(), self.size) for n, path in enumerate(paths)]
 
     def share(self, areas: AreasLike) -> dict[str, float]:
-        """Compute the share of all fixations in areas of interest.
+        """Compute for each area of interest the share of all fixations that lie in it.
 
         Args:
             areas: boxes by name, as left, top, right and bottom edge in pixels of the picture; a text such as

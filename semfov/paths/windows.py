@@ -172,12 +172,12 @@ class WindowWords(Words):
         # Without learned evidence looks are chosen by scores, and slices of photographs always are.
         scores = "the sum of the scores that the first look has in it"
         if self.record.decision is not None:
-            chance = "the probability that it finds the target, also of what closer looks in it would find"
+            chance = "the probability that it finds the target, also by looks at smaller windows in it"
             return scores if self.decided_by == "score" else chance
         is_photograph = self.record.lattice.levels == 1
         if is_photograph or self.measure == "score":
             return scores
-        return "the expected number of new objects in it, with a share of those that closer looks would then show"
+        return "the expected number of new objects in it, with a share of those that smaller windows in it would show"
 
     @property
     def sensor(self) -> str:

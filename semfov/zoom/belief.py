@@ -1,7 +1,8 @@
-r"""The belief about a large picture: what the looks so far predict that closer looks will show.
+r"""The belief about a large picture: how many objects further looks at smaller windows are expected to show.
 
 Looks come in as gists, the strongest hints by cell. For each cell the belief keeps which level it was looked at from,
-what is left to explore there, and what closer looks are expected to find there. Windows are valued by sums over cells:
+what is left to explore there, and how many objects smaller windows are expected to show there. Windows are valued by
+sums over cells:
 
     gists of looks ────► rates of each cell, by level ──┐
                                                         ├──► sums over windows ──► `value`    objects that a look finds
@@ -42,10 +43,10 @@ _CellQuantity = Callable[[int, CellSlices], Cells | None]
 
 
 class Rates(Protocol):
-    """Predicts how many objects closer looks find, such as `GlimpseEvidence` and `Survey`."""
+    """Model such as `GlimpseEvidence` or `Survey` that predicts how many objects smaller windows show."""
 
     foresight: float
-    """Share of what still closer looks would find in a window that counts towards its value."""
+    """Weight of the objects that smaller windows inside a window would show, in the value of the window."""
 
     def rates(self, look: Gist, targets: Tensor, before: Tensor | None = None) -> Tensor: ...
 
@@ -77,7 +78,7 @@ class ZoomBelief:
     Attributes:
         lattice: the cells and windows of the picture.
         target: class from 1; 0 for objects of any class.
-        foresight: share of what still closer looks would find in a window that counts towards its value.
+        foresight: weight of the objects that smaller windows inside a window would show, in the value of the window.
         gists: the looks, in the order in which they were added.
         closest_level: s, level of the closest look at each cell, `(rows, columns)`; -1 where none was.
 
@@ -122,7 +123,7 @@ class ZoomBelief:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all looks; what they predict is kept for those that are added again before the next `clear`."""
+        """Forget all looks; their predictions are kept for looks that are added again before the next `clear`."""
         known = {} if self._learns else self._predictions  # a graph serves one backward pass
         self._predictions = {id(gist): known[id(gist)] for gist in self.gists if id(gist) in known}
         shape = self.lattice.rows, self.lattice.columns
@@ -137,7 +138,7 @@ class ZoomBelief:
 
     @cached_property
     def visible(self) -> Tensor:
-        """Share of each cell where there is something to see, asked for after the overview, `(rows, columns)`."""
+        """Share of each cell that is not blank, `(rows, columns)`; known after the overview."""
         blank = self._blank()
         if blank is None:
             return torch.ones(self.lattice.rows, self.lattice.columns, device=self._targets.device)
@@ -151,17 +152,17 @@ class ZoomBelief:
 
     @property
     def evidence(self) -> GlimpseEvidence:
-        """The learned evidence; only searches ask for it."""
+        """The learned model of searches (`GlimpseEvidence`)."""
         assert isinstance(self._evidence, GlimpseEvidence), "searches go by learned evidence"
         return self._evidence
 
     @property
     def photograph(self) -> PhotographEvidence | None:
-        """The evidence for photographs, where the picture is one: nothing in it can be looked at an octave closer."""
+        """The model for photographs (`PhotographEvidence`), if the picture has only one level of magnification."""
         return self.evidence.photograph if self.lattice.levels == 1 else None
 
     def add(self, look: WindowLook) -> None:
-        """Add a look: its gist, or, of a look that points to no closer ones, that its window is explored.
+        """Add the gist of a look; the window of a look at the last level only becomes explored.
 
         Args:
             look: the look.
@@ -176,7 +177,7 @@ class ZoomBelief:
         self._mark_sums(box)
 
     def discount(self, window: Window) -> None:
-        """Expect nothing more inside a window and at its borders, where a second look finds less than one elsewhere.
+        """Expect no more objects inside a window and at its borders, as if it had been looked at.
 
         Args:
             window: the window, which may reach beyond the picture.
@@ -195,7 +196,7 @@ class ZoomBelief:
             self._mark_sums((x1, y1, x2, y2))
 
     def restore(self, unexplored: Tensor) -> None:
-        """Set back what is left to explore, to undo `discount`.
+        """Restore the unexplored shares of cells, to undo `discount`.
 
         Args:
             unexplored: `(rows, columns)`, an earlier copy of the attribute.
@@ -286,7 +287,7 @@ class ZoomBelief:
 
     @torch.no_grad()
     def remaining(self) -> tuple[float, float]:
-        """Sum what looks are still expected to find, in each cell by the level that finds most.
+        """Sum the objects that looks are still expected to find, in each cell at its best level.
 
         Returns:
             Number of objects in cells that clearly promise one, and in all others.
@@ -327,7 +328,7 @@ class ZoomBelief:
         return None if expected is None else expected * (self.closest_level[slices] < level)
 
     def value(self, level: int, foresight: float) -> Cells:
-        """Value the windows of a level for finding objects (`semfov.zoom.policy.best_find`).
+        """Compute how many objects a look at each window of a level is expected to find (`best_find` uses it).
 
         Args:
             level: of the windows.
@@ -379,7 +380,7 @@ def _by_cell(predicted: Cells, scale: int, shape: tuple[int, ...]) -> Cells:
 
 
 def before_of(rates: Cells, gist: Gist) -> Tensor:
-    """Compute the logarithms of the rates that earlier looks gave in a look's cells.
+    """Compute the logarithms of the rates that earlier looks predicted for the cells of a look.
 
     Args:
         rates: `(rows, columns)` of the lattice in the look, for looks one octave closer than it.

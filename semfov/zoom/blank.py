@@ -1,4 +1,4 @@
-"""The ground of a picture where there is nothing to see: without data, or in the one colour of a blank border."""
+"""Blank parts of a picture: without data, or in the single colour of a border."""
 
 import numpy as np
 import torch
@@ -135,7 +135,7 @@ def _runs(marked: NDArray[np.bool_] | np.bool_) -> _Spans:
 
 
 def reaching_border(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Keep the marked cells that reach the border over marked neighbours.
+    """Keep the marked cells that are connected to the border by marked cells.
 
     Runs of marked cells in a row are linked where they touch. To grow the border cell by cell would take as many steps
     as the longest way is long, and a picture may hold a maze.

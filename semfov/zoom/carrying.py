@@ -1,4 +1,4 @@
-"""Looks that a moving camera carries along: where what they showed lies in the present frame.
+"""Where earlier looks lie in the present frame of a moving camera.
 
     frame t0:  window ▢ with boxes ──── motion since t0 ────►  frame t:  window ▢ and boxes, moved and scaled,
                                                                          the same scores, a map of hints resampled
@@ -23,7 +23,7 @@ from semfov.zoom.looks import Window, WindowLook, nearest_cells
 
 
 def carried(looks: Sequence[WindowLook], motions: Sequence[Motion], lattice: Lattice) -> list[WindowLook]:
-    """Carry looks to another frame.
+    """Transform the windows and boxes of looks to another frame.
 
     Args:
         looks: the looks, as they were taken.

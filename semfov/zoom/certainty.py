@@ -95,7 +95,7 @@ class Certainty(StatedModule):
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> Self:
-        """Make a certainty from the numbers of a file.
+        """Make a certainty from the numbers in a file of a model.
 
         Args:
             numbers: as `numbers` lists them; two are an offset and the weight of the score.
@@ -118,7 +118,7 @@ class Certainty(StatedModule):
 
     @property
     def numbers(self) -> list[float]:
-        """The numbers of a file, as `of` reads them: the shortest decimals of the parameters, and the spread."""
+        """The parameters and the spread as numbers for a file, which `of` reads."""
         regression = _decimals([self.offset, *self.weights])
         if self.strength.isinf():
             return regression[:2]
@@ -137,7 +137,7 @@ class Certainty(StatedModule):
         return (self.offset.to(facts) + exact_product(facts, self.weights.to(facts))).sigmoid()
 
     def unseen(self, expected: tuple[float, float], *, promised: float, discoveries: float) -> tuple[Tensor, Tensor]:
-        """Estimate how many objects further looks would show, n.
+        """Estimate n, the number of objects that only further looks would show.
 
         Args:
             expected: objects that the evidence still expects, in cells that clearly promise one and in others.
@@ -213,7 +213,7 @@ def number_of_faint(chances: Tensor) -> tuple[float, float]:
 
 
 def number_of(chances: Tensor, unseen: tuple[float, float], spread: float) -> tuple[float, float]:
-    r"""Estimate the number of objects, with those that no look has shown.
+    r"""Estimate the number of objects in all, including those that no look has shown.
 
     .. math:: E = \sum_i p_i + E[n], \qquad
               \sigma^2 = \varphi \sum_i p_i (1 - p_i) + \operatorname{Var}[n] + \tau^2 E^2

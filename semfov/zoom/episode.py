@@ -1,4 +1,4 @@
-"""Episodes over the windows of a picture: look, update the belief and choose, for one object of a class, or for all."""
+"""Loops of looks at windows: look, update the belief, and choose the next window."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -33,7 +33,7 @@ _LEAST_SHOWN = 0.75
 
 
 class KeptLook:
-    """A look that counts: as it was taken, and where it lies in the present frame of a stream.
+    """A look that has not been forgotten, and its place in the present frame of a stream.
 
     Attributes:
         original: the look, in pixels of the frame in which it was taken.
@@ -57,20 +57,20 @@ class KeptLook:
         self._motion: Motion | None = None  # of the camera since the look; None as long as it has stood still
 
     def show(self, current: WindowLook) -> None:
-        """Take where the look lies in the next frame; hints that have not changed stay the same object."""
+        """Set the place of the look in the next frame; unchanged hints stay the same object."""
         before = self.current.gist
         if before is not None and current.gist is not None and before.equals(current.gist):
             current = replace(current, gist=before)
         self.current = current
 
     def moved(self, motion: Motion) -> Motion:
-        """Take a motion of the camera to the next frame, and return that since the look."""
+        """Add the camera's motion to the next frame, and return the whole motion since the look."""
         self._motion = motion if self._motion is None else self._motion.then(motion)
         return self._motion
 
 
 def carry_along(looks: list[KeptLook], motion: Motion, lattice: Lattice) -> list[KeptLook]:
-    """Carry looks along with the camera, to the next frame.
+    """Move looks to their places in the next frame, by the motion of the camera.
 
     Args:
         looks: the looks.
@@ -88,7 +88,7 @@ def carry_along(looks: list[KeptLook], motion: Motion, lattice: Lattice) -> list
 
 
 class WindowStep(Generic[_StepBelief_co]):
-    """One step of an episode: a look, the looks that count with it, and the belief after it.
+    """One step of an episode: a look, the earlier looks not yet forgotten, and the belief after it.
 
     Attributes:
         newest: the look.
@@ -115,21 +115,21 @@ class WindowStep(Generic[_StepBelief_co]):
 
     @property
     def value(self) -> float:
-        """The value that the look was chosen for."""
+        """The value for which the look was chosen."""
         return self.newest.value
 
     @property
     def looks(self) -> list[WindowLook]:
-        """The looks at what the present frame shows, where they lie in it."""
+        """The looks whose windows are in view, at their places in the present frame."""
         return [look.current for look in self.kept_looks if look.in_view]
 
     @cached_property
     def choices(self) -> Sequence[WindowChoice]:
-        """The windows to look at next and their values, chosen when they are first asked for."""
+        """The windows to look at next and their values, computed when first read."""
         return self._choose()
 
     def choose_anew(self) -> None:
-        """Forget the choices, as they are of another scene, or other frames have passed since."""
+        """Forget the chosen windows, because the scene has changed or frames have passed."""
         self.__dict__.pop("choices", None)
 
     @property
@@ -229,7 +229,7 @@ def look_by_look(
     forgetting: Forgetting | None = None,
     guess: _Guess | None = None,
 ) -> Iterator[WindowStep[_Belief]]:
-    """Look at the whole picture, and then at the windows of an order, until it has none left.
+    """Look at the whole picture, and then at the windows of an ordered list to its end.
 
     The next windows are chosen after a step was taken; the guessed one is resampled by a second thread during the look
     before. In a stream a look counts for the time in which half of its evidence would fade, or until the next look at
@@ -293,7 +293,7 @@ def look_for(
 def search_windows(
     source: WindowLooks, belief: ZoomBelief, *, forgetting: Forgetting | None = None
 ) -> Iterator[WindowStep[ZoomBelief]]:
-    r"""Look for one object of the class of a belief (`look_for`), where most objects of it are expected.
+    r"""Look for one object of the belief's class, at the windows where most such objects are expected.
 
     The value of a look is the chance of a hit, :math:`1 - e^{-v}` for a Poisson number of objects with the mean v.
     """
@@ -315,7 +315,7 @@ def find_everything(
     forgetting: Forgetting | None = None,
     known: Callable[[int], WindowValues] | None = None,
 ) -> Iterator[WindowStep[ZoomBelief]]:
-    """Look for all objects of a class, or of all classes, look by look, until no look promises enough.
+    """Look for all objects of one class, or of every class, until no look is expected to find enough.
 
     `known` gives by level what a look at each window brings for objects that are known.
     """

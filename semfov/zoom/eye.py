@@ -35,7 +35,7 @@ _MOST_STRETCHED = 4.0  # largest change of proportions; beyond it nothing was me
 
 @dataclass(frozen=True)
 class WindowView:
-    """A picture that an eye can look at. Opening it reads no pixels.
+    """A picture that was opened for a `WindowEye`; its pixels are read when a look needs them.
 
     Attributes:
         picture: source of the pixels, read by windows.
@@ -52,7 +52,7 @@ class WindowView:
 
 
 class WindowDetections(NamedTuple):
-    """The result of several looks.
+    """The detections and windows of several looks.
 
     Attributes:
         detections: a batch of F, boxes in picture pixels.
@@ -124,7 +124,7 @@ class WindowEye(nn.Module):
         return WindowView(source, Lattice.over(source.size, self.detector.input_size, finest=self.finest))
 
     def look(self, view: WindowView, fixations: Tensor) -> Detections:
-        """Look at a picture and detect.
+        """Look at windows of a picture, and detect objects in them.
 
         Args:
             view: the picture, from `open`.
@@ -146,7 +146,7 @@ class WindowEye(nn.Module):
         resampled: Resampled | None = None,
         meanwhile: Callable[[], object] | None = None,
     ) -> WindowDetections:
-        """Look at a picture and return hints too.
+        """Look at windows of a picture, and return their detections and hints (faint candidates).
 
         Args:
             view: the picture, from `open`.
@@ -224,7 +224,7 @@ class WindowEye(nn.Module):
         return unit, torch.tensor(frames, dtype=unit.dtype).view(-1, 8)
 
     def resample(self, view: WindowView, fixations: Tensor, within: Sequence[_Limit | None] | None = None) -> Resampled:
-        """Resample windows for `detect`.
+        """Resample windows to the detector's input, for `detect`.
 
         Args:
             view: the picture, from `open`.
@@ -325,7 +325,7 @@ class WindowEye(nn.Module):
         return self.look(self.open(picture), fixations)
 
     def settings(self) -> dict[str, Any]:
-        """List the settings on which the detections depend, for keys of caches and metadata of fitted models.
+        """List the settings on which detections depend; caches and files of fitted models store them.
 
         Returns:
             JSON values.

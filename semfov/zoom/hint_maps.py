@@ -1,4 +1,4 @@
-"""Maps of the hints of a look, from which small networks predict what closer looks find in each cell."""
+"""Maps of a look's hints, from which small networks predict how many objects smaller windows show."""
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,7 @@ _RINGS = 8  # cells of the closest window, for which the weights of the border a
 
 
 def features(scores: Tensor) -> Tensor:
-    """Compute logarithms of scores, shifted and scaled to about [-1, 1.5].
+    """Compute the logarithms of scores, shifted and scaled to about [-1, 1.5], as inputs of a network.
 
     Args:
         scores: `(...)`, from 0 to 1.
@@ -28,7 +28,7 @@ def features(scores: Tensor) -> Tensor:
 
 
 def hint_maps(hints: Tensor, best: Tensor, detections: Tensor, size: Tensor, crowd: Tensor) -> list[Tensor]:
-    """Describe the hints, detections and sizes of objects in and around each cell of a look.
+    """Compute the inputs of a network: hints, detections and object sizes in and around each cell.
 
     Args:
         hints: `(T, rows, columns)`, feature of the strongest hint of each class.
@@ -59,7 +59,7 @@ def hint_maps(hints: Tensor, best: Tensor, detections: Tensor, size: Tensor, cro
 
 
 def memory_maps(like: Tensor, before: Tensor | None) -> list[Tensor]:
-    """Describe what an earlier, coarser look predicted for each cell, and whether there was one.
+    """Compute the inputs of a network about earlier, coarser looks: their prediction for each cell, if any.
 
     Args:
         like: `(T, rows, columns)`, gives shape, type and device.
@@ -104,7 +104,7 @@ def _band(length: int, side: int, dtype: torch.dtype, device: torch.device) -> T
 
 
 def tapered(border: Tensor, span: int) -> Tensor:
-    """Spread learned weights of the border of a window over the cells along its side.
+    """Interpolate the learned weights at a window's border over the cells along its side.
 
     Args:
         border: `(4,)`, weights before the logistic function, from the border to the middle.
@@ -119,7 +119,7 @@ def tapered(border: Tensor, span: int) -> Tensor:
 
 
 def through(network: nn.Sequential, values: Tensor) -> Tensor:
-    """Apply a network without calls of modules, which cost most of the time in one so small.
+    """Apply a small network layer by layer, without the overhead of calling modules.
 
     Args:
         network: of linear layers and GELU.

@@ -1,4 +1,4 @@
-"""What a look shows of where to zoom in: hints, which are faint candidates too, and the strongest in each cell."""
+"""Hints of where to zoom in: all candidates of a look, also faint ones, and the strongest in each cell."""
 
 import math
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ DETECTION_SCORE = 0.1  # score from which on a detection counts as a found objec
 
 
 class Hints(NamedTuple):
-    """The hints of one look, in no order; several may be of one object.
+    """The hints of one look (candidates, also faint ones), unordered; one object may have several.
 
     Attributes:
         boxes: `(N, 4)`.
@@ -51,7 +51,7 @@ class Gist:
 
     @staticmethod
     def of(hints: Hints, detections: Detections, lattice: Lattice, action: tuple[int, int, int]) -> "Gist":
-        """Compute the gist of a look at a window of the lattice.
+        """Compute the gist of a look: its strongest hint of every class in each cell.
 
         Args:
             hints: hints of the look.

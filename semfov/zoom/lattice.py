@@ -1,4 +1,4 @@
-"""The windows of a picture that an eye can look at: a grid of cells, and windows of cells one octave apart.
+"""The windows that an agent can choose from: squares of cells, at magnifications one octave apart.
 
 level 0                 level 1                 level 2, the last
 ┌───────────────┐       ┌───────┬───────┐       ┌───┬───────────┐
@@ -25,7 +25,7 @@ MOST_IN_LINE = 1 << 14  # cells along a side; sums over the windows of a strip t
 
 @dataclass(frozen=True)
 class Lattice:
-    """A grid of cells over a picture, and the windows of every level that lie on it.
+    """A grid of cells over a picture, and the windows of every magnification level on this grid.
 
     Level 0 has one window, with the whole picture in its upper left corner. A window of level k is half as wide as one
     of level k - 1. Windows of the last level are `CELLS` cells wide. A window starts at the border of a cell, and it
@@ -87,7 +87,7 @@ class Lattice:
 
     @property
     def levels(self) -> int:
-        """Number of magnifications."""
+        """Number of magnification levels."""
         return len(self.magnifications)
 
     @property
@@ -139,7 +139,7 @@ class Lattice:
         return CELLS << (self.levels - 1 - level)
 
     def places(self, level: int) -> tuple[int, int]:
-        """Count the places at which a window can start.
+        """Count the columns and rows of cells at which a window can start.
 
         Args:
             level: its level, from 0.
@@ -165,7 +165,7 @@ class Lattice:
         return sum(across * down for across, down in map(self.places, range(self.levels)))
 
     def boxes(self, actions: Tensor) -> Tensor:
-        """Compute the windows of actions, which may reach beyond the picture.
+        """Compute the boxes of windows, which may reach beyond the picture, in its pixels.
 
         Args:
             actions: `(..., 3)`: level, column and row of the first cell.
@@ -183,7 +183,7 @@ class Lattice:
         return torch.cat([lower, upper], -1).float()
 
     def fixations(self, actions: Tensor) -> Tensor:
-        """Compute the centres and magnifications of actions.
+        """Compute the centres and magnifications of windows.
 
         Args:
             actions: `(..., 3)`: level, column and row of the first cell.

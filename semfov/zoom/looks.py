@@ -49,7 +49,7 @@ class Window:
     @staticmethod
     @lru_cache(4096)
     def on(lattice: Lattice, action: tuple[int, int, int]) -> "Window":
-        """Make the window of an action `(level, column, row)`. It is kept, because a search asks for it many times."""
+        """Make the window with an index `(level, column, row)`, which is cached for the next call."""
         level, column, row = action
         x, y, magnification = lattice.fixation(level, column, row)
         span = lattice.span(level)
@@ -61,12 +61,12 @@ class Window:
 
     @property
     def is_overview(self) -> bool:
-        """Whether it is the window of the lattice that shows the whole picture."""
+        """Whether the window is the lattice's window of the whole picture."""
         return self.level == 0 and self.within is None
 
     @staticmethod
     def around(lattice: Lattice, box: tuple[float, float, float, float]) -> "Window":
-        """Make the window that shows a box of the picture and nothing beyond it, as large as the canvas allows."""
+        """Make the window that shows exactly a box of the picture, at the largest magnification that fits."""
         x1, y1, x2, y2 = box
         canvas_width, canvas_height = lattice.canvas
         magnification = min(canvas_width / (x2 - x1), canvas_height / (y2 - y1))
@@ -79,7 +79,7 @@ class Window:
         return Window(fixation, level, nearest_cells(lattice, box), box)
 
     def region(self, lattice: Lattice) -> tuple[float, float, float, float]:
-        """Part of the picture that it shows, `(x1, y1, x2, y2)` in picture pixels."""
+        """Part of the picture that the window shows, `(x1, y1, x2, y2)` in picture pixels."""
         x1, y1, x2, y2 = self._edges(lattice) if self.within is None else self.within
         width, height = lattice.size
         # A camera that moves carries windows beyond the frame.
@@ -96,12 +96,12 @@ class Window:
         return x - half_width, y - half_height, x + half_width, y + half_height
 
     def centre(self, lattice: Lattice) -> tuple[float, float]:
-        """Centre `(x, y)` in pixels of the part of the picture that it shows, which may end before the window does."""
+        """Centre `(x, y)` of the part of the window that lies in the picture, in picture pixels."""
         x1, y1, x2, y2 = self.region(lattice)
         return (x1 + x2 - 1) / 2, (y1 + y2 - 1) / 2
 
     def points_closer(self, lattice: Lattice) -> bool:
-        """Whether a look tells where to look more closely: it is on the lattice, and not of the last level."""
+        """Whether a look predicts objects in smaller windows: it is on the lattice, and not at the last level."""
         return self.within is None and self.level < lattice.levels - 1
 
 
@@ -114,7 +114,7 @@ class WindowLook:
         detections: a batch of one, boxes in picture pixels.
         cut: `(L,)`, whether the border of the window cuts a box.
         show: `(K,)`, highest score of each class in any hint, or in the detections where no hints were wanted.
-        gist: the hints by cell; None where it does not point to closer looks.
+        gist: the hints by cell; None if the window predicts nothing about smaller windows (`Window.points_closer`).
         hints: all hints, in a photograph alone.
     """
 
@@ -127,7 +127,7 @@ class WindowLook:
 
 
 def half_steps(lattice: Lattice) -> Iterator[Window]:
-    """Yield the windows of all levels that are half a window apart, and those at the right and lower borders."""
+    """Yield windows of all levels at steps of half a window, and those at the right and lower borders."""
     for level in range(lattice.levels):
         half = max(1, lattice.span(level) // 2)
         columns, rows = lattice.places(level)
@@ -137,7 +137,7 @@ def half_steps(lattice: Lattice) -> Iterator[Window]:
 
 
 class WindowLooks(ABC):
-    """Base of sources of looks at one picture: live ones, and stored ones."""
+    """Base of sources of looks at one picture: an eye that looks now, or stored looks."""
 
     lattice: Lattice
     time: float = 0
@@ -152,7 +152,7 @@ class WindowLooks(ABC):
     """Carries what is known along with the camera, as soon as a frame is shown before which it moved."""
 
     def prepare(self, window: Window) -> None:  # noqa: B027
-        """Resample the window that is likely to be looked at next; stored looks need nothing."""
+        """Resample the likely next window in advance; with stored looks this does nothing."""
 
     @abstractmethod
     def see(self, windows: Sequence[Window], *, hints: bool = True) -> list[WindowLook]:
@@ -173,7 +173,7 @@ class LiveWindowLooks(WindowLooks):
         self._prepared: dict[Window, Resampled] = {}
 
     def show(self, view: WindowView, passed: float, camera: CameraStep | None = None) -> None:
-        """Take the next frame of a stream, the seconds that passed, and how the camera moved since the frame before."""
+        """Set the next frame of a stream, with the seconds and the camera's motion since the last frame."""
         self.view = view
         self.passed = passed
         self.time += passed

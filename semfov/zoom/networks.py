@@ -1,4 +1,4 @@
-"""Small networks that read what looks at windows show."""
+"""Small networks, which predict from the hints of looks at windows."""
 
 from torch import nn
 

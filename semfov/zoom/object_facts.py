@@ -1,4 +1,4 @@
-"""Facts about the objects of a large picture, from which a certainty predicts whether they are there (`FACTS`).
+"""Features of objects in a large picture (`FACTS`), from which `Certainty` predicts their probability.
 
     boxes of all looks ──► one box for each object (`index`) ──► what looks show of it, and better objects around it
 
@@ -49,7 +49,7 @@ class DetectedBoxes(NamedTuple):
     magnifications: Tensor
 
     def of(self, rows: Tensor) -> "DetectedBoxes":
-        """Select some of the boxes.
+        """Select boxes by index.
 
         Args:
             rows: `(L,)` boolean, or their indices.
@@ -127,7 +127,7 @@ def object_facts(
     *,
     latest: bool = False,
 ) -> Tensor:
-    """List facts about objects.
+    """Compute the features (`FACTS`) of objects.
 
     Args:
         index: `(M,)`, the box of each object among those that were detected.

@@ -79,7 +79,7 @@ def without_parts(
     iou: float = 0.5,
     inside: float = 0.8,
 ) -> Objects:
-    """Leave out objects of enlarged looks that lie in a more confident object of their class, or around one.
+    """Drop objects of enlarged looks that lie inside or around a more confident object of their class.
 
     In an enlarged window a detector takes parts of an object, and several objects together, for one of its class. A
     certainty that was fitted knows that; scores do not. What a look at the whole picture shows with `SCORE_THRESHOLD`
@@ -134,7 +134,7 @@ def merge_with_facts(
     *,
     latest: bool = False,
 ) -> tuple[Objects, Tensor]:
-    """Merge detections as `merge` does, and list facts of the objects; scores are those of the vectors.
+    """Merge detections as `merge` does, and compute features of the objects for `Certainty`.
 
     Args:
         looks: looks at one picture.
@@ -201,7 +201,7 @@ def probable_objects(
     promised: float = 0.0,
     latest: bool = False,
 ) -> tuple[Objects, tuple[float, float]]:
-    """Merge the detections of several looks, with probabilities as scores, and estimate what no look has shown.
+    """Merge detections to objects with probabilities, and estimate the number of objects not yet seen.
 
     Args:
         looks: looks at one picture, the overview first.

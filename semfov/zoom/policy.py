@@ -95,7 +95,7 @@ def _shares_inside(first: int, end: int, span: int, count: int) -> NDArray[np.fl
 def jointly(
     choose: Callable[[set[Window]], WindowChoice | None], belief: ZoomBelief, done: set[Window], count: int
 ) -> list[WindowChoice]:
-    """Choose several windows to look at together, each as if the windows before it had been looked at.
+    """Choose several windows for one batch, each as if the windows chosen before it had been looked at.
 
     Args:
         choose: chooses one window by the belief, given those that were looked at.

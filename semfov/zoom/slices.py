@@ -1,4 +1,4 @@
-"""Slices of a picture, and their order by the raw scores of the overview: a choice of windows that learns nothing."""
+"""Slices of a picture, ordered by the overview's raw scores: a choice of windows without fitted models."""
 
 from collections.abc import Sequence
 
@@ -41,7 +41,7 @@ def _starts(length: int, side: int, step: int) -> list[int]:
 
 
 def usual_slices(lattice: Lattice, blank: Tensor | None = None) -> list[Window]:
-    """List slices as people cut them, which overlap by a fifth.
+    """List slices with the usual overlap, a fifth of their side.
 
     Args:
         lattice: windows of the picture.

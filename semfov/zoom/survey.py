@@ -1,4 +1,4 @@
-"""The survey: how many objects of any class closer looks find."""
+"""The survey: how many objects of any class looks at smaller windows find."""
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +19,7 @@ from semfov.zoom.hint_maps import (
 from semfov.zoom.hints import Gist
 from semfov.zoom.networks import network
 
-STEPS = 3  # largest number of octaves between a look and the closer looks that are predicted from it
+STEPS = 3  # largest number of octaves between a look and the looks at smaller windows that are predicted from it
 
 _CHANNELS = 8  # kinds of hints, learned mixtures of all classes
 _WIDTH = 48
@@ -29,11 +29,11 @@ _INPUTS = HINT_MAPS + MEMORY_MAPS + 2 * _CHANNELS + len(_SURROUNDINGS) * (_CHANN
 
 
 class Survey(nn.Module):
-    r"""Predicts how many objects of any class closer looks find, :math:`E[n(w)] = \sum_{x \in w} r(x) \lambda(x)`.
+    r"""Predicts how many objects of any class smaller windows show, :math:`E[n(w)] = \sum_{x \in w} r(x) \lambda(x)`.
 
     Args:
         classes: number of classes of the detector, without background.
-        foresight: share of what still closer looks would find in a window that counts towards its value.
+        foresight: weight of the objects that smaller windows inside a window would show, in the value of the window.
     """
 
     def __init__(self, classes: int, *, foresight: float = 0.35) -> None:
@@ -46,7 +46,7 @@ class Survey(nn.Module):
 
     @staticmethod
     def fields() -> dict[str, Field]:
-        """List the requirements of its tensors in the file of a model, by name."""
+        """List the requirements for the tensors in a file of the model, by name."""
         return {
             "mix.weight": Field((_CHANNELS, "K"), low=-1e6, high=1e6),
             **perceptron("rate", _INPUTS, _WIDTH, STEPS),
@@ -54,7 +54,7 @@ class Survey(nn.Module):
         }
 
     def rates(self, look: Gist, targets: Tensor | None = None, before: Tensor | None = None) -> Tensor:
-        """Predict how many objects centred in each cell only closer looks find.
+        """Predict how many objects centred in each cell only smaller windows show.
 
         Args:
             look: the look.

@@ -58,7 +58,7 @@ def enclosing(first: CellBox | None, second: CellBox) -> CellBox:
 
 @torch.inference_mode(False)
 def writable_tensor(shape: tuple[int, ...], value: float, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Make a tensor of one value that may be written to in every mode of PyTorch, whichever it is now.
+    """Make a tensor filled with one value, which can be changed in every mode of PyTorch.
 
     Args:
         shape: shape of the tensor.
@@ -114,7 +114,7 @@ class WindowSums:
         return band
 
     def mark(self, box: CellBox) -> None:
-        """Note that the cells in a box may have changed.
+        """Mark the cells in a box as possibly changed.
 
         Args:
             box: the cells.
@@ -122,7 +122,7 @@ class WindowSums:
         self.changed = enclosing(self.changed, box)
 
     def update(self) -> Cells:
-        """Sum the cells of every window that holds a changed one.
+        """Compute the sums of all windows that contain a changed cell.
 
         Returns:
             `(down, across)`, the sums of all windows; with gradients a copy of them. The next call changes others.

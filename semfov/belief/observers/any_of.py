@@ -114,7 +114,7 @@ class AnyOf(Observer):
 
 
 def class_meant(belief: Belief, target: int) -> int:
-    """Find the class that a search is about.
+    """Find the most probable class of a search for any of several classes.
 
     Args:
         belief: the belief of the search, of one episode.

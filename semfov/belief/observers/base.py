@@ -220,7 +220,7 @@ def _check_looks(belief: Belief, detections: Detections, fixation: Tensor, grid:
 
 
 def own(value: object, kind: type[_Kind], argument: str) -> _Kind:
-    """Check that a belief or a look is of the kind that an observer makes.
+    """Check that a belief or a look has the class that an observer makes.
 
     Args:
         value: the belief or the look.
@@ -242,7 +242,7 @@ def own(value: object, kind: type[_Kind], argument: str) -> _Kind:
 
 
 def faded(belief: DirichletBelief, prior: float, keep: float) -> DirichletBelief:
-    """Discount the evidence of past looks in a belief: its parameters and its closest looks.
+    """Discount past looks in a belief: its parameters, and the distances of the closest looks.
 
     Args:
         belief: the belief.
@@ -272,7 +272,7 @@ def faded_parameters(beta: Tensor, prior: float, keep: float) -> Tensor:
 
 
 def farther(keep: float) -> float:
-    """Compute by how much farther the closest look is when a share of its evidence is left.
+    """Compute how much distance to add to the closest look when a share of its evidence is left.
 
     Args:
         keep: the share.

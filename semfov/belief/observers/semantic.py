@@ -1,4 +1,4 @@
-"""The paper's observer: a Dirichlet belief about all classes in every cell."""
+"""The observer of the paper (Luzio, Bernardino and Moreno, 2024): a Dirichlet over all classes in every cell."""
 
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -36,13 +36,13 @@ class SemanticEvidence(Evidence):
 
 
 class Semantic(Observer):
-    r"""The paper's observer: a Dirichlet over all classes in every cell, updated by every detection that covers it.
+    r"""The observer of the paper: a Dirichlet over all classes in a cell, updated by each detection that covers it.
 
     Three options are not in the paper. They exist because looks at a static scene are not independent, and because
     cells without detections are evidence, too:
 
     - `tempering` τ: the likelihood λ is replaced by `λ^τ` (`likelihoods`).
-    - `memory="closest"`: the belief about a cell comes from its closest look alone; a closer look replaces it,
+    - `memory="closest"`: the belief about a cell comes from its closest look alone; one from nearer replaces it,
 
       .. math:: \beta(x) \leftarrow \mathrm{fuse}(\beta_0, \lambda) \quad \text{if } d(x, f) < \min_{f' < f} d(x, f')
 
@@ -117,7 +117,7 @@ class Semantic(Observer):
         nearest = torch.minimum(old.closest, semantic.distance)
         if self.memory == "all":
             return replace(old, beta=self._fuse(old.beta, semantic), closest=nearest)
-        # A cell takes all of a closer look, or nothing of it.
+        # A look from a nearer fixation replaces the belief about a cell; any other look does not change it.
         fused = self._fuse(torch.full_like(old.beta, self.prior), semantic)
         is_closer = (semantic.distance < old.closest)[..., None]
         return replace(old, beta=torch.where(is_closer, fused, old.beta), closest=nearest)
@@ -147,5 +147,5 @@ class Semantic(Observer):
         return faded(dirichlet_belief(belief), self.prior, keep)
 
     def extra_repr(self) -> str:
-        """Write prior, fusion rule, footprint and tempering."""
+        """Return prior, fusion rule, footprint and tempering for `repr`."""
         return f"prior={self.prior:g}, fusion={self.fusion}, footprint={self.footprint}, tempering={self.tempering:g}"

@@ -1,4 +1,4 @@
-"""The observer of explorations: the paper's belief about all classes, with what a look says about a whole cell."""
+"""The observer of explorations: a Dirichlet over all classes in each cell, with one likelihood for each look."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ from semfov.precision import exact_product
 
 @dataclass(frozen=True)
 class CellEvidence(Evidence):
-    """What looks say about whole cells.
+    """Evidence of looks about whole cells.
 
     Attributes:
         ratio: likelihood of the classes given a detection, relative to background, summed over the detections that
@@ -41,7 +41,7 @@ class SemanticMap(Observer):
 
     Kaplan's rule (`semfov.fusion.kaplan`) fuses it with a prior ε = 1e-5 of every class. The mean of the belief is then
     :math:`(\varepsilon + P_k) / (1 + (K + 1) \varepsilon)` with :math:`P_k = \lambda_k / \sum_j \lambda_j`, which is as
-    good as P. A closer look replaces a farther one, because looks at a static scene are not independent.
+    good as P. A look from a nearer fixation replaces earlier ones, because looks at a still scene are not independent.
 
     Args:
         model: calibrates the scores, and has m, a and w (its `log_cell`).
@@ -68,7 +68,7 @@ class SemanticMap(Observer):
         return DirichletBelief(like.new_full((batch, len(grid), self.components), WEAK_PRIOR))
 
     def weigh(self, detections: Detections, fixation: Tensor, grid: Grid, target: int | None = None) -> CellEvidence:
-        """Sum what the detections in each cell say, the same for every target."""
+        """Sum the likelihood ratios of the detections in each cell, the same for every target."""
         ratio = likelihood_ratios(detections, fixation, grid, self.model)
         covered = cells_of_detections(detections, grid).to(ratio)
         ratio_of_cells = exact_product(covered.mT, ratio)  # (B, X·Y, K+1)
@@ -89,7 +89,7 @@ class SemanticMap(Observer):
         return torch.cat([log_background.expand_as(objects[..., :1]), objects], -1)
 
     def unseen(self, like: Tensor) -> Tensor:
-        """Compute the probabilities of all classes in a cell in which nothing was detected.
+        """Compute the class probabilities of a cell without any detection.
 
         Args:
             like: a tensor of the device and the precision of the result.
@@ -100,7 +100,7 @@ class SemanticMap(Observer):
         return self.log_likelihood(like.new_zeros(self.components)).softmax(-1)
 
     def update(self, belief: Belief, look: Evidence) -> DirichletBelief:
-        """Take the likelihood of cells to which the look is closer than all before."""
+        """Replace the belief in cells to which this fixation is nearer than all earlier ones."""
         old = dirichlet_belief(belief)
         cells = own(look, CellEvidence, "look")
         prior = torch.full_like(old.beta, WEAK_PRIOR)
@@ -114,7 +114,7 @@ class SemanticMap(Observer):
         )
 
     def fade(self, belief: Belief, look: Evidence, keep: float, visited: Tensor) -> DirichletBelief:
-        r"""Move the Dirichlet parameters towards the prior, and the closest looks away.
+        r"""Move the Dirichlet parameters towards the prior, and increase the distances of the closest looks.
 
         .. math:: \beta \leftarrow \beta_0 + k (\beta - \beta_0)
         """

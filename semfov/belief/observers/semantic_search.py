@@ -1,4 +1,4 @@
-"""The observer of searches: the paper's belief about all classes, with misses, and one detection for each cell."""
+"""The observer of searches: a Dirichlet in each cell, if a look missed the object or one detection shows it."""
 
 from dataclasses import dataclass, field, replace
 from typing import Self
@@ -22,7 +22,7 @@ from semfov.observation.thresholds import Thresholds
 
 @dataclass(frozen=True)
 class SearchEvidence(Evidence):
-    """Likelihoods of a batch of looks, of which one detection may show the object of a cell.
+    """Likelihoods of a batch of looks, if at most one detection of each look shows the object of a cell.
 
     Attributes:
         ratio: likelihood of the classes given each detection, relative to background, `(B, L, K+1)`.
@@ -45,7 +45,7 @@ class SearchEvidence(Evidence):
 
 @dataclass(frozen=True, repr=False)
 class SearchBelief(DirichletBelief):
-    """A Dirichlet belief of a search, which goes on only if it has not fixated its target.
+    """A Dirichlet belief of a search, under the condition that no fixated cell holds the target.
 
     Attributes:
         following: `(B, X·Y, K+1)`, Dirichlet parameters given that no fixated cell holds the target (`chance`); `beta`
@@ -100,7 +100,7 @@ class SearchBelief(DirichletBelief):
         return belief if self.calibration is None else replace(belief, calibration=self.calibration.detach())
 
     def facts(self, target: int | Tensor) -> Tensor:
-        """Give what the probability of presence depends on (`semfov.observation.presence.presence_facts`).
+        """Return the facts for the probability of presence (`semfov.observation.presence.presence_facts`).
 
         Args:
             target: as for `probability`.
@@ -157,7 +157,7 @@ class SemanticSearch(Observer):
         self.prior = Prior() if prior is None else prior
 
     def with_prior(self, prior: PriorLike, target: int) -> Self:
-        """Assume another share of searches whose target is there.
+        """Make an observer that assumes another share of searches with a present target.
 
         Args:
             prior: the share (`Prior.of`).
@@ -212,7 +212,7 @@ class SemanticSearch(Observer):
         )
 
     def unseen(self, like: Tensor) -> Tensor:
-        """Compute the probabilities of all classes in a cell as far away as can be, in which nothing was detected.
+        """Compute the class probabilities of a cell without detections, at the largest distance.
 
         Args:
             like: a tensor of the device and the precision of the result.
@@ -227,7 +227,7 @@ class SemanticSearch(Observer):
         return self.model.presence.of_cells(probability, self.footprint)
 
     def update(self, belief: Belief, look: Evidence) -> SearchBelief:
-        """Fuse a look in each episode: given the looks alone, and for the next fixation."""
+        """Fuse one look in each episode, into the belief and into the belief that chooses the next fixation."""
         old = own(belief, SearchBelief, "belief")
         seen = own(look, SearchEvidence, "look")
         visited = old.visited.scatter(1, seen.fixated[:, None], True)
@@ -251,7 +251,7 @@ class SemanticSearch(Observer):
         )
 
     def fade(self, belief: Belief, look: Evidence, keep: float, visited: Tensor) -> SearchBelief:
-        r"""Move the Dirichlet parameters towards the prior, and the closest looks away.
+        r"""Move the Dirichlet parameters towards the prior, and increase the distances of the closest looks.
 
         .. math:: \beta \leftarrow \beta_0 + k (\beta - \beta_0)
         """

@@ -108,7 +108,7 @@ class ExpectedGain(AcquisitionFunction):
         self.register_buffer("distance", grid.cell_distance)
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Compute values `(B, X·Y)`, in cells, for a belief about all classes, which knows each cell's closest look."""
+        """Compute values `(B, X·Y)`, in cells, for a belief about all classes that has `closest` distances."""
         distance = self.distance.to(belief.closest)
 
         def gain(probabilities: Tensor, closest: Tensor) -> Tensor:
@@ -118,7 +118,7 @@ class ExpectedGain(AcquisitionFunction):
 
 
 def corrected_cells(probabilities: Tensor, closest: Tensor, distance: Tensor, fovea: float) -> Tensor:
-    """Compute the terms of `ExpectedGain`, how probable it is that a look corrects each cell.
+    """Compute the probability that a look corrects each cell: the terms of `ExpectedGain`.
 
     Args:
         probabilities: `(B, X·Y, K+1)`, class probabilities of a map.

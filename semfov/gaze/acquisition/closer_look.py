@@ -1,4 +1,4 @@
-"""Exploration that brings the fovea closer to cells whose class is not known yet."""
+"""Exploration by nearer fixations: it moves the fovea towards cells whose class is uncertain."""
 
 from torch import Tensor
 
@@ -9,10 +9,10 @@ from semfov.gaze.acquisition.base import AcquisitionFunction
 
 
 class CloserLook(AcquisitionFunction):
-    r"""By how much a fixation improves the best view so far of the cells whose class is not known.
+    r"""Gain in acuity of a fixation, over the nearest fixation so far, at cells whose class is uncertain.
 
-    Successive looks from one distance detect, and miss, the same objects; only a closer look shows more. A cell
-    therefore counts by the acuity v that the fixation adds to that of its closest look so far, at distance :math:`d^*`:
+    Successive looks from one distance detect, and miss, the same objects; only a nearer fixation shows more. So a cell
+    counts by the acuity v that the fixation adds to that of the nearest fixation so far, at distance :math:`d^*`:
 
     .. math:: a(f) = \sum_x \bigl(1 - \max_k q_k(x)\bigr) \bigl[v(d(x, f)) - v(d^*(x))\bigr]_+, \qquad
               v(d) = e^{-\max(d / r - 1,\, 0)}
@@ -47,7 +47,7 @@ class CloserLook(AcquisitionFunction):
         self.register_buffer("seen", acuity(grid.cell_distance, fovea))
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Compute values `(B, X·Y)` for a belief about all classes, which knows each cell's closest look."""
+        """Compute values `(B, X·Y)` for a belief about all classes that has `closest` distances."""
         return one_by_one(self._values, belief.class_probabilities(), belief.closest)
 
     def _values(self, probabilities: Tensor, closest: Tensor) -> Tensor:

@@ -61,11 +61,11 @@ class KLDivergence(Lookahead):
         self.prior = prior
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Compute the divergence from the prior after the look."""
+        """Compute the divergence of each cell from the prior after the simulated look."""
         return divergence_from_symmetric(outlook.next_beta, self.prior)
 
     def present(self, beta: Tensor) -> Tensor:
-        """Compute the divergence from the prior."""
+        """Compute the divergence of each cell from the prior at present."""
         return divergence_from_symmetric(beta, self.prior)
 
 
@@ -124,14 +124,14 @@ class NegativeEntropy(Lookahead):
     tasks = ("exploration",)
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Decrease of the entropy."""
+        """Compute the decrease of each cell's entropy by the look."""
         surprise = torch.xlogy(outlook.mean, outlook.mean)[..., None, :]
         # H(p) - H(p') = KL(p' || p) + Σ (p' - p) ln p
         return _divergence(outlook) + (outlook.growth * surprise).sum(-1)
 
 
 class TwoPeaks(Lookahead):
-    r"""Largest change, over the cells of the map, of the margin of the most probable class over the second.
+    r"""Largest change, over all cells, of the difference between the two most probable classes of a cell.
 
     .. math:: a(f) = \max_x |\Delta(p'(x \mid f)) - \Delta(p(x))|, \qquad \Delta(p) = p_{(1)} - p_{(2)}
 
@@ -154,11 +154,11 @@ class TwoPeaks(Lookahead):
     tasks = ("exploration",)
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Compute the absolute change of the margin."""
+        """Compute the absolute change of the difference between the two most probable classes."""
         return (_lead(outlook.next_mean) - _lead(outlook.mean)[..., None]).abs()
 
     def pool(self, values: Tensor) -> Tensor:
-        """Take the largest change over the map."""
+        """Return the largest change over all cells."""
         return values.amax(-2)
 
 
@@ -195,11 +195,11 @@ class UpperConfidenceBound(Lookahead):
         self.kappa = kappa
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Compute the bound after the look."""
+        """Compute the upper confidence bound of each cell after the simulated look."""
         return self._bound(outlook.next_mean, outlook.next_total)
 
     def present(self, beta: Tensor) -> Tensor:
-        """Compute the bound."""
+        """Compute the present upper confidence bound of each cell."""
         total = beta.sum(-1)
         return self._bound(beta / total[..., None], total)
 
@@ -244,7 +244,7 @@ class ProbabilityOfImprovement(Lookahead):
         self.margin = margin
 
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Compute the probability of improvement."""
+        """Compute the probability that the look makes a cell's most probable class more probable."""
         peak = outlook.next_mean.amax(-1)
         gain = peak - outlook.mean.amax(-1)[..., None] - self.margin
         return torch.special.ndtr(gain / _deviation(peak, outlook.next_total))

@@ -1,4 +1,4 @@
-"""One-step lookahead: the belief about the whole map after the scores that are expected of a fixation, or drawn."""
+"""One-step lookahead: the belief about all cells after a look with expected or randomly drawn scores."""
 
 from abc import abstractmethod
 from functools import partial
@@ -23,7 +23,7 @@ _GOLDEN = (5**0.5 - 1) / 2  # multiples of it, modulo 1, cover [0, 1) evenly, ho
 
 
 class Outlook(NamedTuple):
-    """The present belief about cells, and that after a look from each of N levels; by M samples N M in place of N.
+    """The present belief about cells, and the beliefs after a simulated look from each of N levels of distance.
 
     Attributes:
         beta: Dirichlet parameters of the present belief, `(..., X·Y, K+1)`.
@@ -121,7 +121,7 @@ def _outlook(beta: Tensor, total: Tensor, mean: Tensor, likelihood: Tensor) -> O
 
 
 def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) -> Outlook:
-    r"""Simulate Kaplan's update of every cell with M looks drawn from the belief, at every level of distance.
+    r"""Simulate Kaplan's update of every cell with M random looks from the belief, at every level of distance.
 
     .. math:: k_m \sim p, \qquad \lambda_m = \lambda_{k_m n m}, \qquad E[F] \approx \frac1M \sum_m F(\beta'(\lambda_m))
 
@@ -155,7 +155,7 @@ def look_ahead_by_samples(beta: Tensor, likelihoods: Tensor, visited: Tensor) ->
 def sampled_likelihoods(
     model: FovealObservationModel, samples: int, *, calibrated: bool = True, seed: int = 0
 ) -> Tensor:
-    r"""Draw looks at an object of each class from each level of distance, and compute their likelihoods.
+    r"""Sample scores of objects of each class at each level of distance, and compute their likelihoods.
 
     .. math:: S_{knm} \sim \mathrm{Dir}(\alpha_{kn}), \qquad \lambda_{knm} = P(C = \cdot \mid S_{knm}, n)
 
@@ -194,7 +194,7 @@ def sampled_likelihoods(
 
 
 class DrawnLooks(nn.Module):
-    """Likelihoods of looks that are drawn from an observation model (`sampled_likelihoods`), kept until it changes.
+    """Likelihoods of random looks (`sampled_likelihoods`), cached until the observation model changes.
 
     Args:
         model: the observation model, which is no part of this module.
@@ -217,7 +217,7 @@ class DrawnLooks(nn.Module):
         self.register_buffer("state", torch.cat(_values_of(model)), persistent=False)  # that these looks are of
 
     def forward(self, model: FovealObservationModel) -> Tensor:
-        """Take the looks that were drawn from a model before, or draw them anew if it has changed since.
+        """Return the cached looks, or sample new ones if the model has changed.
 
         In a graph, and for a model in `torch.func`, values cannot be compared, and the looks are those drawn last.
 
@@ -244,7 +244,7 @@ def _values_of(model: FovealObservationModel) -> list[Tensor]:
 
 
 class Lookahead(AcquisitionFunction):
-    """Base of the acquisition functions of exploration that look one step ahead, once from each level of distance."""
+    """Base of acquisition functions of exploration that simulate one look from each level of distance."""
 
     levels: Tensor
     likelihoods: Tensor | None
@@ -336,14 +336,14 @@ class Lookahead(AcquisitionFunction):
 
     @abstractmethod
     def cell_values(self, outlook: Outlook) -> Tensor:
-        """Compute the value of each cell after a look from each level, `(..., X·Y, N)`, `present` not subtracted."""
+        """Compute the value of each cell after a look from each level, `(..., X·Y, N)`; `present` is not subtracted."""
 
     def present(self, beta: Tensor) -> Tensor:
-        """Compute the value of the present belief about each cell, `(..., X·Y)`, to subtract from those of looks."""
+        """Compute the value of the present belief about each cell, `(..., X·Y)`; `cell_values` minus it is the gain."""
         return beta.new_zeros(beta.shape[:-1])
 
     def pool(self, values: Tensor) -> Tensor:
-        """Sum the values `(..., seen cell, fixation)` over the map: the value of each fixation, `(..., X·Y)`."""
+        """Sum the gains `(..., seen cell, fixation)` over seen cells: the value of each fixation, `(..., X·Y)`."""
         return values.sum(-2)
 
 

@@ -1,4 +1,4 @@
-"""Acquisition functions of visual search that account for all cells within the fovea, and not the fixated one alone."""
+"""Acquisition functions of visual search that count all cells near the fixation, not just the fixated one."""
 
 from abc import abstractmethod
 
@@ -62,7 +62,7 @@ class FovealHit(_TargetVisibility):
     by_place = True
 
     def values(self, present: Tensor, visibility: Tensor) -> Tensor:
-        """Compute the probability of a detection."""
+        """Compute the probability that a look detects the target in any cell."""
         # The product of the misses as a sum of logarithms, which is exact also where it is nearly 1.
         log_of_misses = torch.log1p(-present[..., None, :] * visibility).sum(-1)
         return -torch.expm1(log_of_misses)

@@ -1,4 +1,4 @@
-"""Acquisition functions of visual search that go by the probability of the target."""
+"""Acquisition functions of visual search, computed from the probability of the target in each cell."""
 
 import torch
 from torch import Tensor

@@ -21,7 +21,7 @@ class Uniform(AcquisitionFunction):
     by_belief = False
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Give zeros `(..., X·Y)`."""
+        """Return zeros `(..., X·Y)`."""
         return belief.closest.new_zeros(belief.closest.shape)
 
 
@@ -48,6 +48,6 @@ class Static(AcquisitionFunction):
         self.register_buffer("values", values)
 
     def forward(self, belief: Belief, visited: Tensor) -> Tensor:
-        """Give the values `(..., X·Y)`, for a belief about the same number of cells."""
+        """Return the fixed values `(..., X·Y)`; the belief must have as many cells."""
         check_shape(self.values, "values", belief.closest.shape[-1])
         return self.values.expand(belief.closest.shape)

@@ -1,4 +1,4 @@
-"""Where an image attracts the gaze, whatever the task: a density fitted to people, and bottom-up saliency beside it.
+"""Where an image attracts the gaze without a task: a density fitted to people, and bottom-up saliency.
 
 VOCUS2 is the baseline of Luzio, Bernardino and Moreno (2024, section IV-B), computed anew on the foveated view of every
 fixation. VOCUS2 builds on the model of Itti, Koch and Niebur; the paper has no figures for that model.

@@ -1,4 +1,4 @@
-"""The density of people's fixations, read out of the feature maps that a detector computes anyway."""
+"""The density of people's fixations, predicted from a detector's feature maps."""
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -136,7 +136,7 @@ class FixationDensity(Pretrained):
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | PathLike[str]) -> Self:
-        """Load a model that is shipped with the package, one that `save` wrote, or that of a folder of `semfov fit`.
+        """Load a shipped model, a file that `save` wrote, or the model in a folder of `semfov fit`.
 
         Args:
             name_or_path: name of a shipped model, or path of a file or of a folder that holds `gaze.safetensors`.
@@ -154,7 +154,7 @@ class FixationDensity(Pretrained):
 
     @classmethod
     def for_detector(cls, detector: Detector) -> Self:
-        """Give the model that is shipped for a detector.
+        """Return the model that is shipped for a detector.
 
         Args:
             detector: the detector.
@@ -170,7 +170,7 @@ class FixationDensity(Pretrained):
         return model
 
     def check_compatible(self, detector: Detector) -> None:
-        """Raise `InputError` for another detector than the model was fitted for; warn where a setting differs.
+        """Raise `InputError` if the model was fitted for another detector; warn if a setting differs.
 
         Args:
             detector: the detector whose feature maps are read.
@@ -249,7 +249,7 @@ class FixationDensity(Pretrained):
     def readouts(
         self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int], read: Tensor | None = None
     ) -> Tensor:
-        """Compute the readouts, whose mean is the map once it is blurred.
+        """Compute the readouts, whose blurred mean is the map.
 
         Args:
             features: as for `forward`.
@@ -324,7 +324,7 @@ class FixationDensity(Pretrained):
         scanpath: Tensor,
         corner: tuple[int, int, int] = (0, 0, 1),
     ) -> dict[str, Tensor]:
-        """Compute the terms after scanpaths `(B, n, 2)`: with their gains, and with the oculomotor biases.
+        """Compute the terms given scanpaths `(B, n, 2)`: weighted map and centre bias, and the oculomotor biases.
 
         Args:
             terms: map and centre bias `(B, rows, columns)` or `(1, rows, columns)`.
@@ -365,7 +365,7 @@ class FixationDensity(Pretrained):
         fixations: int,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Draw scanpaths, one fixation after the other, each from the density after those before.
+        """Sample scanpaths: each fixation from the density that is predicted from the fixations before it.
 
         Args:
             terms: `terms` of one picture without a scanpath.
@@ -396,7 +396,7 @@ class FixationDensity(Pretrained):
         return path
 
     def extra_repr(self) -> str:
-        """Write its layers and readouts."""
+        """Return the layers and the number of readouts for `repr`."""
         return f"layers={self.layers}, readouts={self.mix.shape[0]}, units={self.mix.shape[1]}"
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -429,7 +429,7 @@ _read = cache(FixationDensity.from_pretrained)  # shipped files do not change
 
 
 def shared_density(detector: Detector) -> FixationDensity:
-    """Give the model of `FixationDensity.for_detector`, one for all who do not change it."""
+    """Return a cached model of `FixationDensity.for_detector`, which callers must not change."""
     folder = FixationDensity.shipped
     path = folder / f"{detector.name}.safetensors"
     if not path.is_file():
@@ -445,7 +445,7 @@ def shared_density(detector: Detector) -> FixationDensity:
 
 
 def density_for(detector: Detector, model: FixationDensity | str | PathLike[str] | None) -> FixationDensity:
-    """Find the model for a detector: the shipped one, or a copy of the given one, checked.
+    """Return the model for a detector: the shipped one, or a copy of the given one after a check.
 
     Args:
         detector: the detector.
@@ -485,7 +485,7 @@ def cells_of(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def blurred(maps: Tensor, sigma: Tensor) -> Tensor:
-    """Blur maps by a Gaussian whose weights sum to 1 at the border, too.
+    """Blur maps by a Gaussian, whose weights also sum to 1 at the border.
 
     Args:
         maps: `(..., rows, columns)`.

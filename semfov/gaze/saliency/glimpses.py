@@ -1,4 +1,4 @@
-"""What a fovea has shown of a picture so far: the feature maps of its looks, joined by closeness."""
+"""Feature maps of all looks of a fovea so far, joined: each place from the look with the closest fixation."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from semfov.errors import check, check_shape
 
 
 def features_so_far(views: FeatureMaps, fixations: Tensor, scanpath: Tensor) -> FeatureMaps:
-    r"""Join the feature maps of foveated views: each place has those of the look with the closest fixation.
+    r"""Join the feature maps of foveated views: each place is taken from the view with the closest fixation.
 
     .. math:: \Phi(u) = \phi_{i^*}(u), \quad i^* = \arg\min_{i \le n} \lVert u - f_i \rVert
 

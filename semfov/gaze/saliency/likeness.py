@@ -1,4 +1,4 @@
-"""How unlike the pictures of a fit a picture is, by the means of a detector's feature maps."""
+"""How much a picture differs from the pictures of a fit, by statistics of a detector's feature maps."""
 
 from collections.abc import Iterable
 from typing import Self
@@ -17,7 +17,7 @@ _LEAST = 1e-3  # deviation of a channel whose logarithm is taken, so that a flat
 
 
 class PictureLikeness(nn.Module):
-    r"""Distance of a picture from those of a fit, by mean and deviation of each channel of feature maps.
+    r"""Distance of a picture from the pictures of a fit, by mean and deviation of each feature channel.
 
     .. math:: d^2 = \frac{1}{P} \Big( \sum_k \frac{(v_k^\top z)^2}{\lambda_k}
               + \frac{\|z\|^2 - \sum_k (v_k^\top z)^2}{\sigma^2} \Big)
@@ -57,7 +57,7 @@ class PictureLikeness(nn.Module):
 
     @classmethod
     def fitted(cls, pooled: Tensor, *, axes: int = 4, alike: float = 0.99) -> Self:
-        """Fit the distance to pictures.
+        """Fit the distance to the feature maps of pictures.
 
         The limit is the mean of two: each half of the pictures is measured by the distance that is fitted to the other.
 

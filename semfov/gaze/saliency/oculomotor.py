@@ -1,4 +1,4 @@
-"""Oculomotor biases: where the eye goes next after a scanpath, whatever is in the picture."""
+"""Oculomotor biases: where the eye tends to go after a scanpath, independent of the picture."""
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +18,7 @@ _MEMORY = 8  # number of earlier fixations that refixation depends on, the lates
 
 
 class OculomotorBias(nn.Module):
-    r"""Log bias of the next fixation for saccade length and direction, for turns and for refixation.
+    r"""Log bias of the next fixation by saccade length and direction, turns, and returns to earlier fixations.
 
     .. math:: o(u \mid f_1 \ldots f_n) = \sum_k s_k(r) \, \phi_k(\theta) + \sum_k t_k(r) \cos(k\tau)
               + \sum_{i<n} b_{n-i}(\|u - f_i\|)

@@ -1,4 +1,4 @@
-"""Where a picture lies on feature maps, and their values at the cells of the picture."""
+"""Where a picture lies on a detector's feature maps, and the values of the maps at its cells."""
 
 from collections.abc import Mapping
 from math import ceil, floor
@@ -12,7 +12,7 @@ from semfov.sensor.constants import constant
 
 
 class Side(NamedTuple):
-    """Where the picture is along one side of a map of `length` pixels.
+    """Position of the picture along one side of a map of `length` pixels.
 
     Attributes:
         start: its first edge, in pixels of the map.
@@ -30,7 +30,7 @@ class Side(NamedTuple):
 
 
 def sides_of(features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int]) -> tuple[Side, Side]:
-    """Find where the picture is in maps.
+    """Compute the position of the picture in feature maps.
 
     Args:
         features: as for `FixationDensity.forward`; plain maps are of the whole picture.
@@ -59,7 +59,7 @@ def sides_of(features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int
 def on_picture(
     values: Tensor, features: FeatureMaps | Mapping[str, Tensor], shape: tuple[int, int], cells: tuple[int, int]
 ) -> Tensor:
-    """Interpolate values of maps of a shape at the cells of the picture.
+    """Interpolate feature maps at the centres of the picture's cells.
 
     Args:
         values: `(B, U, h, w)`, where the picture is.

@@ -1,4 +1,4 @@
-"""Views of a picture for its map: the whole, its mirror image, and windows, joined on the cells of the picture."""
+"""Views of a picture (the whole, its mirror image, windows), whose maps are joined on the picture's cells."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -41,12 +41,12 @@ class PictureView(NamedTuple):
     mirrored: bool = False
 
     def covers(self, cells: tuple[int, int]) -> bool:
-        """Tell whether the view is of the whole picture."""
+        """Whether the view shows the whole picture."""
         return (self.top, self.left, self.rows, self.columns) == (0, 0, *cells)
 
     @property
     def weight(self) -> Tensor:
-        """Weight of each of its cells, `(rows, columns)`: 1 in the middle, falling to the edges."""
+        """Weight of each cell of the view, `(rows, columns)`: 1 in the middle, less towards the edges."""
         return _ramp(self.rows)[:, None] * _ramp(self.columns)
 
 
@@ -58,7 +58,7 @@ def _ramp(cells: int) -> Tensor:
 
 
 def views_of(cells: tuple[int, int], quality: Quality, *, panorama: bool = False) -> list[PictureView]:
-    """List the views from which the map of a picture is joined.
+    """Make the views whose maps are joined to the map of a picture.
 
     A photograph is looked at as a whole, for `best` also in its mirror image and in four windows of two thirds of its
     sides. The windows on the right are mirrored, so that the mirror image of a photograph has the mirrored map. A
@@ -104,7 +104,7 @@ def _windows(rows: int, columns: int) -> Iterable[PictureView]:
 
 
 class PictureTerms(NamedTuple):
-    """What a model says of a picture.
+    """The terms of a model's log density for one picture.
 
     Attributes:
         terms: map and centre bias (`FixationDensity.terms`).
@@ -192,7 +192,7 @@ def _edges(first: int, count: int, pixels: float) -> slice:
 
 
 def joined(maps: Sequence[Tensor], views: Iterable[PictureView], cells: tuple[int, int]) -> Tensor:
-    r"""Join the maps of views on the cells of a picture.
+    r"""Join the maps of views to one map over the cells of a picture.
 
     .. math:: m(u) = s \, \bar m_{\text{whole}}(u) + (1 - s) \frac{\sum_v w_v(u) \, m_v(u)}{\sum_v w_v(u)}
 

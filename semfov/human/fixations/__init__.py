@@ -1,4 +1,4 @@
-"""Readers and writers of fixations in the file formats of the field, and what is suspicious in them."""
+"""Readers and writers of the common file formats of fixations, and checks for suspicious fixations."""
 
 from semfov.human.fixations.exports import read_export
 from semfov.human.fixations.eyelink import read_eyelink

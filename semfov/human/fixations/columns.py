@@ -45,7 +45,7 @@ _LARGEST = 1e6  # largest coordinate and side in pixels
 
 
 class DataFrame(Protocol):
-    """What is read of a `pandas.DataFrame`."""
+    """Protocol of the parts of a `pandas.DataFrame` that are read."""
 
     @property
     def columns(self) -> Iterable[object]: ...
@@ -54,7 +54,7 @@ class DataFrame(Protocol):
 
 
 class Row(NamedTuple):
-    """A row of a table.
+    """A row of a table, with its number for error messages.
 
     Attributes:
         table: name of the table, for messages.
@@ -71,7 +71,7 @@ class Row(NamedTuple):
         return f"{self.table}: {self.place}"
 
     def number(self, name: str) -> float:
-        """Read a field that is a number; raises `DataError` for one that is empty, or too large for a coordinate."""
+        """Read a field as a number; raises `DataError` if it is empty, or too large for a coordinate."""
         value = self.number_or_none(name)
         if value is None:
             raise DataError(f"{self}, {name}: expected a number, got nothing")
@@ -80,7 +80,7 @@ class Row(NamedTuple):
         return value
 
     def number_or_none(self, name: str) -> float | None:
-        """Read a field that is a number; None for one that is empty or not there."""
+        """Read a field as a number, or return None if the field is empty or missing."""
         text = self.fields.get(name)
         if not text:
             return None
@@ -115,7 +115,7 @@ class Table(NamedTuple):
     def of(
         cls, name: str, columns: list[str], lines: Iterable[tuple[str, Sequence[str]]], encoding: str = "utf-8"
     ) -> "Table":
-        """Make a table of its lines.
+        """Make a table from lines of text.
 
         Args:
             name: for messages.
@@ -131,7 +131,7 @@ class Table(NamedTuple):
         return cls(name, columns, rows, repeated, encoding)
 
     def check_different(self, columns: Iterable[str | None]) -> None:
-        """Raise `DataError` for columns to be read whose names others have, too."""
+        """Raise `DataError` if several columns have the name of a column that is to be read."""
         repeated = sorted(self.repeated.intersection(columns))
         check_data(not repeated, self.name, "one column of a name", f"several named {', '.join(repeated)}")
 

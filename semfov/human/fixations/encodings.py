@@ -1,4 +1,4 @@
-"""Texts of recordings in the encoding of older programs of Windows, whose names may be those of another one."""
+"""Reading of text files in Unicode, or in the encoding of older Windows programs."""
 
 import re
 import warnings
@@ -15,7 +15,7 @@ _NO_TEXT = re.compile(r"[\x00-\x08\x0e-\x19\x1b-\x1f\ufffd]")  # signs that no t
 
 
 def read_recording(path: str | PathLike[str]) -> tuple[str, str]:
-    """Read a text in Unicode (UTF-8, UTF-16 or UTF-32), else in that of Windows for Western Europe.
+    """Read a text in Unicode (UTF-8, UTF-16 or UTF-32), or else in Windows' encoding for Western Europe.
 
     Args:
         path: the file.
@@ -33,12 +33,12 @@ def read_recording(path: str | PathLike[str]) -> tuple[str, str]:
 
 
 def file_name(path: str) -> str:
-    """Take the name of a file from a path of Windows or Unix, perhaps in quotes, as messages have it."""
+    """Return the file name in a path of Windows or Unix, which may be in quotes as in trackers' messages."""
     return path.strip('"').replace("\\", "/").rpartition("/")[2]
 
 
 def warn_of_letters(source: str | PathLike[str], encoding: str, fixations: list[Fixations]) -> list[Fixations]:
-    """Warn of names whose letters are right only if the encoding is that of the file.
+    """Warn of names with letters that may be wrong because the file's encoding is only assumed.
 
     Args:
         source: the file, for the message.

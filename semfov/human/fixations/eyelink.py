@@ -1,4 +1,4 @@
-"""Fixations in the text files of EyeLink trackers (ASC, as edf2asc writes them), by the clock of the recording."""
+"""Fixations in the text files of EyeLink trackers (ASC, as written by edf2asc)."""
 
 import math
 import re

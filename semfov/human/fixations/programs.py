@@ -39,7 +39,7 @@ _FRAME = re.compile(r"^(mcs|dacs|ucs|hucs|rcs)\s*")
 
 
 class Column(NamedTuple):
-    """A column of a table, and what its name tells: `Fixation point X [MCS px]` has a frame and a unit.
+    """A column of a table, with the frame and unit in its name, as in `Fixation point X [MCS px]`.
 
     Words in brackets that are no unit are part of the name, as in `x (screen)`.
 
@@ -60,7 +60,7 @@ class Column(NamedTuple):
 
     @classmethod
     def of(cls, name: str) -> "Column":
-        """Take a name to pieces.
+        """Split the name of a column into its key, frame and unit.
 
         Args:
             name: as the table has it.
@@ -82,17 +82,17 @@ class Column(NamedTuple):
 
     @property
     def length(self) -> Units | None:
-        """Unit of a coordinate or side; None for a unit that is not read. Without a unit, pixels."""
+        """Unit of a coordinate or side: pixels if the name has none, None if the unit is unknown."""
         return LENGTHS.get(self.unit) if self.unit else "pixels"
 
     @property
     def milliseconds(self) -> float | None:
-        """Milliseconds of the unit of a duration; None for a unit that is not read. Without a unit, 1."""
+        """Milliseconds in the unit of a duration: 1 if the name has no unit, None if the unit is unknown."""
         return TIMES.get(self.unit) if self.unit else 1.0
 
 
 def key_of(name: str) -> str:
-    """Find the key of a name: its letters and digits, in lower case.
+    """Compute the key of a column's name: its letters and digits, in lower case.
 
     >>> key_of("Fixation point X")
     'fixationpointx'
@@ -142,7 +142,7 @@ class Program(NamedTuple):
     lacks: tuple[str, ...] = ()
 
     def fits(self, columns: Sequence[Column]) -> bool:
-        """Tell whether a table is of this program.
+        """Tell whether this program wrote a table, by its columns.
 
         Args:
             columns: of the table.
@@ -155,7 +155,7 @@ class Program(NamedTuple):
         return has_points and keys.issuperset(self.needs) and keys.isdisjoint(self.lacks)
 
     def of_point(self, key: str, columns: Sequence[Column]) -> list[Column]:
-        """Find the columns of x or of y, in any unit.
+        """Return the columns of x or of y, in any unit.
 
         Args:
             key: of x or y.
@@ -323,7 +323,7 @@ PROGRAMS = (
 
 
 def program_of(columns: Sequence[Column]) -> Program | None:
-    """Find the program of a table.
+    """Return the program that wrote a table.
 
     Args:
         columns: of the table.

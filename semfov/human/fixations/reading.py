@@ -1,4 +1,4 @@
-"""Reading of fixations from a file of any format of this folder, which its content tells."""
+"""Reading of fixations from a file in any known format, which is recognised by its content."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -28,7 +28,7 @@ _BEGINNING = re.compile(r'\s*(?:(\[)|\{\s*"(?:[^"\\]|\\.)*"\s*:\s*(\[)|\{)')
 
 
 def read_fixations(source: str | PathLike[str] | DataFrame, **options: Any) -> list[Fixations]:
-    r"""Read fixations from a file of any format that is known, or from a `pandas.DataFrame`.
+    r"""Read fixations from a file in any known format, or from a `pandas.DataFrame`.
 
     Files `.asc`, and texts that begin like them, are EyeLink's (`read_eyelink`); files `.json` are those of
     COCO-Search18, OSIE, or Ruarte and others. All other files are tables, in the format of this library (`read_table`)
@@ -57,7 +57,7 @@ def read_fixations(source: str | PathLike[str] | DataFrame, **options: Any) -> l
 
 
 def read_by(reader: _Reader, source: str | PathLike[str] | DataFrame, options: Mapping[str, object]) -> list[Fixations]:
-    """Read a source by a reader, if it has these options.
+    """Read a source with a reader; raises an error if the reader lacks one of the options.
 
     Args:
         reader: chosen by `reader_of`.
@@ -136,7 +136,7 @@ def _is_eyelink(source: str | PathLike[str]) -> bool:
 
 
 def check_usual_frame(path: str | PathLike[str], argument: str, sizes: Iterable[tuple[int, int]], how: str) -> None:
-    """Refuse a file of OSIE's form for pictures of another size than those of OSIE, unless a frame is given.
+    """Refuse a file in OSIE's format if its pictures differ in size from OSIE's and no frame is given.
 
     Such a file does not tell its frame. In OSIE's, points of smaller pictures with the same proportions would lie too
     far left and up, and nothing would show it.
@@ -162,7 +162,7 @@ def check_usual_frame(path: str | PathLike[str], argument: str, sizes: Iterable[
 
 
 def frame_of(text: str, name: str = "size") -> tuple[int, int]:
-    """Read the width and the height of a frame that the option `name` gives, such as `1920,1080` or `800x600`."""
+    """Parse the width and the height of a frame in the option `name`, such as `1920,1080` or `800x600`."""
     try:
         width, height = (int(side) for side in text.lower().replace("x", ",").split(","))
     except ValueError:

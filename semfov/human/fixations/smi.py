@@ -87,7 +87,7 @@ class Events(NamedTuple):
 
 
 def has_events(text: str) -> bool:
-    """Tell whether a text has the events of an eye tracker of SMI, fixations among them."""
+    """Tell whether a text has events of an SMI eye tracker that include fixations."""
     return any(section.lower() == _FIXATIONS for section, _ in _SECTION.findall(text))
 
 

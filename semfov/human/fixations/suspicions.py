@@ -1,4 +1,4 @@
-"""What is suspicious in fixations: their frame, unit, origin and axes, a letterbox, repeats, blinks and durations."""
+"""Checks for wrong frames, units, origins, axes, letterboxes, repeats, blinks and durations of fixations."""
 
 import warnings
 from collections import Counter
@@ -41,7 +41,7 @@ _LONG = 5000.0
 
 
 def suspicions(fixations: Sequence[Fixations], sizes: Mapping[str, tuple[int, int]] | None = None) -> list[str]:
-    """Say what is suspicious in fixations, in lines of plain text; none if nothing is.
+    """List what is suspicious in fixations, as lines of text.
 
     - Points that do not look like those of their frame: fractions, pixels or degrees from the centre, y before x, a
       smaller frame, or many outside it; with `sizes`, frames of other proportions than those of their pictures, and
@@ -90,7 +90,7 @@ def _of_frames(
 
 
 def other_frame_of(fixations: Sequence[Fixations], *, units: bool = True) -> str | None:
-    """Say what unit, origin, axes or frame fixations look like, if not their own.
+    """Describe another unit, origin, axis or frame that fits the fixations better than their own, if any.
 
     Args:
         fixations: the records, at least one.
@@ -383,7 +383,7 @@ def _long_durations(durations: _Array) -> list[str]:
 
 
 def check_viewed(fixations: Fixations, argument: str, size: tuple[int, int], picture: str | None = None) -> None:
-    """Refuse fixations in a frame of other proportions than a picture, or in another picture.
+    """Raise an error if the frame of fixations differs in proportions from a picture, or if the picture differs.
 
     Args:
         fixations: the record.
@@ -409,7 +409,7 @@ def check_viewed(fixations: Fixations, argument: str, size: tuple[int, int], pic
 def warn_of_frames(
     source: str | PathLike[str], fixations: list[Fixations], *, units: bool = True, stacklevel: int = 3
 ) -> list[Fixations]:
-    """Warn of fixations that do not look like those of their frame, with what they look like.
+    """Warn of fixations that seem to be in another frame, unit or axis, and name it.
 
     Args:
         source: the file, for the message.
@@ -433,7 +433,7 @@ def warn_of_frames(
 
 
 def warn_outside(source: str | PathLike[str], fixations: list[Fixations], *, stacklevel: int = 3) -> list[Fixations]:
-    """Warn of fixations that lie farther than `_FAR` outside their frame, with their share.
+    """Warn of the share of fixations that lie farther than `_FAR` outside their frame.
 
     Args:
         source: the file, for the message.

@@ -41,11 +41,11 @@ Size = tuple[int, int] | Mapping[str, tuple[int, int]]
 
 
 class FrameError(DataError):
-    """A table does not tell the frame of its points, which `size` may give."""
+    """Error for a table without the size of its frame; the argument `size` can give it."""
 
 
 class PictureError(DataError):
-    """A table does not name the picture, which `picture` may give."""
+    """Error for a table without names of pictures; the argument `picture` can give one."""
 
 
 _ERRORS: dict[str, type[DataError]] = {"picture": PictureError, **dict.fromkeys(_SIZE, FrameError)}
@@ -216,7 +216,7 @@ def _stated_milliseconds(table: str, name: str) -> float:
 
 
 def scaled(text: str, factor: float) -> str:
-    """Multiply a number by a factor; a text that is none stays, and is refused with its place later."""
+    """Multiply a number by a factor; a text that is no number stays, and causes an error later."""
     if factor == 1:
         return text
     try:
@@ -255,7 +255,7 @@ def _remedy_of_missing(fields: Sequence[str]) -> str:
 
 
 def name_pictures(rows: Sequence[Row], picture: str, table: str) -> None:
-    """Write the name of the picture that a user gives into rows of one picture; raises `DataError` for several."""
+    """Write a picture's name into the rows of a picture; raises `DataError` if they name several pictures."""
     names = sorted({row.fields["picture"] for row in rows if row.fields["picture"]})
     got = f"{len(names)} of them, such as {', '.join(names[:3])}; leave picture= out"
     check_data(len(names) <= 1, table, "at most one name of a picture beside picture=", got)
@@ -280,7 +280,7 @@ _AXES: dict[Origin, _Axes] = {
 
 
 class Coordinates(NamedTuple):
-    """In which unit, and from where, a table gives points and boxes."""
+    """Unit and origin of the points and boxes in a table."""
 
     units: Units
     origin: Origin
@@ -295,7 +295,7 @@ class Coordinates(NamedTuple):
         return self._from_corner(points, frame) - 0.5
 
     def box(self, edges: Sequence[float], frame: tuple[int, int]) -> tuple[float, float, float, float]:
-        """Convert the edges of a box, x1, y1, x2 and y2, to those of pixels of a frame `(width, height)`."""
+        """Convert the edges x1, y1, x2 and y2 of a box to pixels of a frame `(width, height)`."""
         corners = np.array(edges, dtype=np.float64).reshape(2, 2)
         if self != ("pixels", "top left"):
             corners = self._from_corner(corners, frame)
@@ -313,7 +313,7 @@ class Coordinates(NamedTuple):
 
 
 def records_of(table: str, rows: Sequence[Row], size: Size | None, coordinates: Coordinates) -> list[Fixations]:
-    """Make a record of the rows of each scanpath, with a warning of what their coordinates look like.
+    """Join the rows of each scanpath to one record, and warn if coordinates seem to be in another frame.
 
     Args:
         table: its name, for messages.
@@ -347,7 +347,7 @@ def records_of(table: str, rows: Sequence[Row], size: Size | None, coordinates: 
 
 
 def named_columns(columns: Mapping[str, str] | None, known: Sequence[str]) -> dict[str, str]:
-    """Check the names of columns that a user gives.
+    """Check the user's names of columns.
 
     Args:
         columns: names in a source by ours; None for none.

@@ -1,4 +1,4 @@
-"""Tables in which a fixation is not one row with a column for x and one for y."""
+"""Conversion of tables in which a fixation is not one row with a column for x and one for y."""
 
 import re
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ _MAPPED = re.compile(r"mapped (fixation [xy]|eye movement type(?: index)?) \[(.+
 
 
 def unfolded(table: Table) -> Table:
-    """Give each fixation a row, and its place two columns.
+    """Convert a table so that each fixation has one row, with a column for x and one for y.
 
     Args:
         table: a column `location` may have pairs `[x, y]`, and each snapshot of glasses columns of its own. Snapshots

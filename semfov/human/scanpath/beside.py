@@ -35,7 +35,7 @@ _Words = TypeVar("_Words", bound=Sized)  # what a scanpath is compared as
 
 
 class BesidePeople(NamedTuple):
-    """A measure of a scanpath, and of people.
+    """The value of one measure for a scanpath, and for people.
 
     Attributes:
         scanpath: of the scanpath against each person, on average.
@@ -318,7 +318,7 @@ def _people_density(points: _Points, size: tuple[int, int], shape: tuple[int, ..
 
 
 def compare_density(prediction: GazePrediction, people: _People) -> dict[str, float]:
-    """Compare a density with all fixations of people but their first ones, and with their blurred density.
+    """Compare a density with people's fixations (without first ones), and with the blurred density of these.
 
     Args:
         prediction: the density.

@@ -1,4 +1,4 @@
-"""Saliency maps and densities over a whole picture, beside the pixels that people fixated, or their map."""
+"""Measures that compare a picture's saliency map or density with people's fixations, or their density."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
