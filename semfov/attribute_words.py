@@ -1,4 +1,4 @@
-"""What others, and other programs, call an attribute of the package, an agent or a record, and who answers with ours.
+"""Other names for attributes of the package, an agent or a record; the error message names the right one.
 
 Each table has our words, and beside them those of others, separated by blanks.
 """
@@ -263,7 +263,7 @@ GAZE_PREDICTION = by_word(
 def missing(
     owner: str, name: str, words: Mapping[str, str], known: Iterable[str] = (), of_class: str = ""
 ) -> AttributeError:
-    """Make the error of an attribute that is not there, with ours where others have another word for it.
+    """Make the error for a missing attribute, which names our attribute if the name is a known synonym.
 
     Args:
         owner: what has no such attribute.
@@ -297,14 +297,14 @@ def _near(name: str, known: tuple[str, ...]) -> str:
 
 
 class Room(ModuleType):
-    """A module that answers a call with what is meant (`CALLS`)."""
+    """A module whose call raises an error that names the function to call instead (`CALLS`)."""
 
     def __call__(self, *arguments: object, **options: object) -> NoReturn:
         raise TypeError(f"{self.__name__} is a module, which is not called; use {CALLS[self.__name__]}")
 
 
 class OtherWords:
-    """Base of classes that answer others' words for their attributes with ours (`_other_words`).
+    """Base of classes whose errors name the right attribute for a known synonym (`_other_words`).
 
     Those that hold objects also answer the name of a class, with what has its objects (`_objects`).
     """

@@ -57,7 +57,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def type_of(value: object) -> str:
-    """Name the type of a value with its article, such as `an int`, for a message."""
+    """Return the type of a value with its article, such as `an int`, for a message."""
     name = type(value).__name__
     return f"{'an' if name[0] in 'aeiouAEIOU' else 'a'} {name}"
 
@@ -289,7 +289,7 @@ def _question(options: list[str]) -> str:
 
 
 def rename_former(options: dict[str, object], known: Collection[str]) -> None:
-    """Give options of a call their present names, with a warning for each that has an earlier one.
+    """Rename options with earlier names to their present names, with a warning for each.
 
     Args:
         options: the options of the call of a function, which are changed.

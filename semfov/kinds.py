@@ -1,4 +1,4 @@
-"""The kinds of look, and what is known of each of them without an agent: how it is named, looked by and drawn."""
+"""The kinds of look (fovea, windows, head), with their names and how they are drawn."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,4 @@
-"""Threads: one for small tensors, where waiting for others costs more than they save, and one beside a detector."""
+"""Threads: one thread for small tensors, which is faster than several, and one beside a detector."""
 
 import multiprocessing
 import os

@@ -1,4 +1,4 @@
-"""What others, and other programs, call an option or a command; the command reads it before it loads anything.
+"""Other names for options and commands, from other programs; read before anything is loaded.
 
 Each table has our words, and beside them those of others, separated by blanks.
 """
@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 
 
 def by_word(rows: Mapping[str, str]) -> dict[str, str]:
-    """Turn a table round: our words by each of the words of others."""
+    """Invert a table: map each word of other programs to ours."""
     return {word: ours for ours, others in rows.items() for word in others.split()}
 
 

@@ -75,7 +75,7 @@ class EntropyLimit(_SignalSearch):
 
 
 class CorrectLocalisation(_SignalSearch):
-    r"""Probability that the most probable cell after a look is that of the target: the Bayesian ideal searcher.
+    r"""Probability that the target is in the most probable cell after a look: the Bayesian ideal searcher.
 
     The cell x of the target gives a response :math:`W_x \sim N(1/2, 1/d'^2)`, and every other cell one of
     :math:`N(-1/2, 1/d'^2)`. A response multiplies the cell's probability by :math:`e^{d'^2 W}`. With q as in

@@ -1,4 +1,4 @@
-"""The agent and the classes that the options name, with what can be checked before anything is loaded."""
+"""The agent and the classes in the options of a command, checked as far as possible before loading."""
 
 import warnings
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ def _check_kind_of_weights(weights: Path | None, detector: str) -> None:
 
 
 def detector_of(options: AgentOptions) -> str:
-    """Name the detector: the one that is given, else the one that the file of a model was fitted to, or the default.
+    """Return the detector's name: from the options, from the file of a fitted model, or the default.
 
     Args:
         options: the options of a command.
@@ -119,7 +119,7 @@ _OF_ONNX = "head", "colour", "input_size", "logits", "remember"
 
 
 def check_onnx_options(options: DetectorOptions, detector: str) -> None:
-    """Raise `InputError` where an option of ONNX files is given for a detector that is none.
+    """Raise `InputError` if an option of ONNX files is given for a detector that is no ONNX file.
 
     Args:
         options: the options of a command.

@@ -21,7 +21,7 @@ _BEGIN = "/gradio_api/startup-events"  # Gradio itself asks for it once, before 
 
 
 def token_for(host: str) -> str | None:
-    """Draw the token that visitors of a page need, where others than this machine can reach it.
+    """Make a random token that visitors of a page need if other machines can reach it.
 
     Args:
         host: address that the page is served on.
@@ -60,7 +60,7 @@ class Layer(ABC):
 
 
 class Doorkeeper(Layer):
-    """A layer of the server that answers requests of its own page alone, under an address that it was given.
+    """A layer of the server that rejects requests from other pages, or to other addresses.
 
     With a token, the first request has it in its address; the browser then keeps it in a cookie.
 

@@ -1,4 +1,4 @@
-"""Formats of files of results: what a picture adds to a file, and how the file is written of the pictures so far.
+"""Formats of result files: what a picture adds to a file, and how the file is written.
 
 A format is one class, which is registered under its suffix by being defined. The command, its help and its checks know
 it from then on. Formats are text: a binary one also needs `semfov.cli.results`. This file imports no tensors, as the
@@ -59,7 +59,7 @@ class ResultsFormat(ABC):
         """Raise `InputError` where one file cannot hold the results of all these pictures."""
 
     def added(self, record: Record, name: str, file: Path | None) -> Values:
-        """Make what the row of a picture has in this format beside `picture`.
+        """Make the values in a picture's row of this format, besides `picture`.
 
         Args:
             record: the record of the picture.
@@ -280,7 +280,7 @@ class CocoResults(ResultsFormat):
         return json.dumps(_parts(_looked_at(rows)), indent=1) + "\n"
 
     def judgement(self, rows: Sequence[Row]) -> str:
-        """Tell AP and AP50 of the objects against the annotations."""
+        """Compute AP and AP50 of the objects against the annotations."""
         looked_at = _looked_at(rows)
         classes = {name for row in looked_at for name in row["classes"]}
         return self.truth.judge(_parts(looked_at), [row["image_id"] for row in looked_at], classes)

@@ -1,4 +1,4 @@
-"""What the commands search, find and explore do with a picture: jobs that any process can make from the options."""
+"""Jobs of the commands search, find and explore: what a process does with a picture."""
 
 import io
 import sys
@@ -117,7 +117,7 @@ class PictureJob(ABC, Generic[_Options_co]):
         self.title = "exploration"
 
     def depends_on(self) -> dict[str, object]:
-        """List what outcomes depend on beside pictures and code, by content; fitted models stand for themselves."""
+        """List what outcomes depend on besides pictures and code, such as settings and fitted models."""
         agent = self.agent
         manifest = self.options.model_file
         if self.options.models_folder is not None:

@@ -1,4 +1,4 @@
-"""What is kept of a look at a picture: texts, rows of results, figures, and its part of a page."""
+"""The outcome for one picture: texts, rows of results, figures, and its part of a page."""
 
 from __future__ import annotations
 

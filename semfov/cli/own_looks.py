@@ -57,7 +57,7 @@ class OwnLooks(NamedTuple):
         return x, y
 
     def describe(self) -> str:
-        """Say what the last look showed and what is believed; at the end, how many looks it took; Markdown."""
+        """Describe the last look and the belief, and at the end the number of looks, as Markdown."""
         record = self.record
         assert record.presence is not None
         chances = record.presence.tolist()
@@ -73,7 +73,7 @@ class OwnLooks(NamedTuple):
         return f"**{outcomes}**, from the same first look.\n\n{last}"
 
     def marks(self) -> str:
-        """Collect what is drawn over the picture, as JSON; points and boxes in pixels of the picture."""
+        """Collect the points and boxes to draw over the picture, in its pixels, as JSON."""
         record = self.record
         grid, belief = record.belief_map(len(record) - 1)  # (X·Y,)
         detections = confident_detections(record.looks[-1].detections)[0]

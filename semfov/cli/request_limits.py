@@ -1,4 +1,4 @@
-"""What the page of `semfov app` may be asked for: its own addresses, small requests, and files that it was given."""
+"""Limits on requests to the page of `semfov app`: its own addresses and files, and a limited size."""
 
 import asyncio
 import json
@@ -31,7 +31,7 @@ _MOST_DIGITS = 20  # of a size
 
 
 class RequestLimits(Layer):
-    """A layer of the server that passes on what its own page asks for, and nothing else.
+    """A layer of the server that passes on only the requests of its own page.
 
     A request names only files in the folder of uploads, as the server would open, or fetch, any other.
 

@@ -157,14 +157,14 @@ def held_outputs(options: object) -> AbstractContextManager[None]:
 
 
 class FinishedWork:
-    """What a command keeps of its pictures until all are looked at: nothing, where it cannot be continued."""
+    """Stored outcomes of the pictures of an unfinished command, from which it can continue."""
 
     def outcomes(self) -> Iterator[tuple[int, Values]]:
         """Yield what an interrupted command has kept of pictures, by their numbers."""
         yield from ()
 
     def keep(self, number: int, values: Mapping[str, object]) -> None:
-        """Keep what is known of a picture, as JSON values."""
+        """Store the outcome of a picture, as JSON values."""
 
     def end(self, part: str) -> None:
         """End the command, and say how it continues.

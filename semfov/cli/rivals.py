@@ -1,4 +1,4 @@
-"""Ways to look at pictures beside each other: by semfov, at all slices, and at the best slices first."""
+"""Ways to look at pictures, compared: by semfov, at all slices, and at the best slices first."""
 
 import time
 from abc import ABC, abstractmethod
@@ -40,7 +40,7 @@ _AFTER = (1, 2, 4, 8, 16, 24, 32, 48, 64)  # passes after which the objects foun
 
 
 class Finding(NamedTuple):
-    """What a way of looking has found in a picture.
+    """Objects that one way of looking has found in a picture.
 
     Attributes:
         passes: passes of the detector so far.
@@ -61,7 +61,7 @@ Way = Callable[[LargePicture], list[Finding]]
 
 @dataclass(frozen=True)
 class Point:
-    """What a way of looking finds with some passes, over all pictures.
+    """Result of one way of looking with a number of passes, over all pictures.
 
     Attributes:
         way: name of the way.
@@ -215,7 +215,7 @@ def _slices_of(lattice: Lattice, side: int, overlap: float) -> list[Window]:
 
 
 class Reference(ABC):
-    """What objects count as right.
+    """Reference that says which objects count as right.
 
     Args:
         classes: names of the detector's classes.
@@ -289,7 +289,7 @@ class SlicesReference(Reference):
 
 
 class AnnotatedReference(Reference):
-    """The boxes of an annotation file, whose ids pictures and categories have.
+    """Reference from an annotation file: its boxes, and its ids of pictures and categories.
 
     Args:
         classes: names of the detector's classes.
@@ -384,7 +384,7 @@ class Scores:
             self._found[way][image] = findings_of_way
 
     def points(self) -> list[Point]:
-        """List what each way finds after each number of passes.
+        """List the results of each way of looking after each number of passes.
 
         Returns:
             The points, way by way in the order of their passes.

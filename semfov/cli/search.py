@@ -54,7 +54,7 @@ def look_at(options: PictureOptions, stream: TextIO) -> int:
 
 
 def with_target(options: PictureOptions) -> PictureOptions:
-    """Take the target from among the pictures: `semfov search kitchen.jpg cup`.
+    """Read the target from the list of pictures, as in `semfov search kitchen.jpg cup`.
 
     Args:
         options: the options of a command.

@@ -1,4 +1,4 @@
-"""Pictures that a command names: files, those of folders, or examples that come with the package."""
+"""The pictures of a command: files, all pictures of folders, or examples that come with the package."""
 
 import os
 import sys
@@ -87,7 +87,7 @@ class PictureSource(NamedTuple):
         return Panorama(pixels) if width == 2 * height else Flat(pixels)
 
     def version(self) -> list[object]:
-        """List what changes with the file: its name, size and time of change."""
+        """Return the file's name, size and time of change, which show whether it has changed."""
         if self.file is None:
             return [self.name]
         try:
@@ -97,7 +97,7 @@ class PictureSource(NamedTuple):
         return [printable(str(self.file.resolve())), status.st_size, status.st_mtime_ns]
 
     def tell_example(self) -> None:
-        """Say that this picture, which comes with the package, stands for those that were not given."""
+        """Print that this example is used because no picture was given."""
         print(f"no picture was given: looking at {self.name}, which comes with semfov")
 
     def tell_skipped(self, fault: Exception) -> None:

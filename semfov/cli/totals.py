@@ -1,4 +1,4 @@
-"""What was found in all pictures of a command, and how many objects of each class to expect in them."""
+"""Totals over the pictures of a command: objects found, and objects to expect, of each class."""
 
 import math
 from collections import Counter

@@ -59,7 +59,7 @@ class Truth:
             warnings.warn(f"{self.path}: {empty} boxes have no area, and are not judged", stacklevel=3)
 
     def image_id(self, name: str) -> Id:
-        """Find the id of a picture by its name; of several of one name that whose folders agree best.
+        """Find the id of a picture by its name; among equal names, the path that agrees in most folders.
 
         Where no image is named as the picture is, names agree in any letter case, and as other systems and addresses
         write them: `K%C3%BCche.JPG` for `Küche.jpg`. Then come the names that programs give to uploaded pictures, on
@@ -85,7 +85,7 @@ class Truth:
         return images[0]
 
     def orientation(self, image: Id, name: str, size: tuple[int, int], file: Path | None) -> int:
-        """Tell in which EXIF orientation the boxes of a picture are: 1 for upright, else that of its file.
+        """Return the EXIF orientation to which a picture's boxes refer: 1 (upright), or that of the stored file.
 
         Args:
             image: id of the image.

@@ -14,7 +14,7 @@ _MOST_PAGES = 8  # below the first one that are looked at; cameras write two or 
 
 
 def check_no_raw(path: str | PathLike[str]) -> None:
-    """Raise `DataError` for a raw file of a camera, whose thumbnail would be taken for the picture.
+    """Raise `DataError` for a raw file of a camera, because only its thumbnail would be read.
 
     Args:
         path: the file, of any kind.

@@ -1,4 +1,4 @@
-"""What the file of a video says of itself: its container by the first bytes, and how far its statements hold."""
+"""Containers of video files, recognised by their first bytes, and checks of the length that they state."""
 
 import re
 from pathlib import Path

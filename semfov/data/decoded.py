@@ -1,4 +1,4 @@
-"""Decoded pictures, whose values become pixels over white a few rows at a time: whole copies would need far more."""
+"""Decoded pictures, which are converted to pixels a few rows at a time to save memory."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

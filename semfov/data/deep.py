@@ -1,4 +1,4 @@
-"""Colours of 16 bits a channel in PNG and PPM files, of which Pillow gives the upper eight bits alone."""
+"""Reading of PNG and PPM files with 16 bits a channel, of which Pillow returns only the upper eight bits."""
 
 from collections.abc import Callable
 from os import PathLike
@@ -40,7 +40,7 @@ def is_deep(image: "ImageFile") -> bool:
 
 
 class DeepValues(NamedTuple):
-    """The values of a file that `is_deep`, which are joined from two decoded halves when they are asked for.
+    """The values of a file with more than 8 bits a channel, joined from two decoded halves when read.
 
     Attributes:
         shape: `(H, W, C)`; of two or four channels, the last one is an alpha.
@@ -80,7 +80,7 @@ class DeepValues(NamedTuple):
 
 
 def rows_of(image: "Image", rows: slice) -> NDArray[Any]:
-    """Take some rows of a decoded image as an array."""
+    """Copy rows of a decoded image to an array."""
     return np.asarray(cut(image, rows))
 
 

@@ -1,4 +1,4 @@
-"""What the file of a picture says of its values, in the same words whichever library reads it.
+"""Description of the values in a picture's file, the same for all libraries that read it.
 
     tifffile's page, or GDAL's dataset ──► Description ──► bands that are shown
                                                       └──► Display ──► bytes of pixels, over white
@@ -28,7 +28,7 @@ _SAMPLE_SIDE = 64  # pixels
 
 @dataclass(frozen=True)
 class Description:
-    """What a file that is read by windows says of its values.
+    """Description of the values in a file that is read by windows.
 
     Attributes:
         path: the file.
@@ -135,7 +135,7 @@ class Description:
 
 @dataclass(frozen=True)
 class Display:
-    """How the values of a file become the bytes that are shown.
+    """Rule that converts the values of a file to bytes for display.
 
     Attributes:
         limits: the values that are black and white; None for those of 8 or 16 bits.

@@ -108,7 +108,7 @@ def _single(scenes: EmbeddedScenes, index: int) -> Scene:
 
 
 def example_with(target: str | None, classes: Sequence[str]) -> str:
-    """Name the first photograph that shows an object of a class of the detector.
+    """Return the name of the first example photograph that shows an object of a class.
 
     Args:
         target: name of the class; None for any photograph.

@@ -1,4 +1,4 @@
-"""Opening of rasters by the GDAL driver of their kind, which reads the file itself and nothing beside it.
+"""Opening of rasters with the one GDAL driver for their format, which reads no other files.
 
 GDAL would choose a driver by the content of a file, and some of its drivers send requests or read other files.
 """
@@ -51,7 +51,7 @@ class WindowOptions(TypedDict):
 
 
 class Raster(Protocol):
-    """What is read of a raster: a dataset of rasterio, or a mosaic (`semfov.data.vrt.Mosaic`).
+    """Protocol of a raster: a dataset of rasterio, or a mosaic (`semfov.data.vrt.Mosaic`).
 
     Attributes:
         width, height: in pixels.
@@ -88,7 +88,7 @@ class Raster(Protocol):
 
 
 class Dataset(Raster, Protocol):
-    """What is read of a dataset of rasterio alone."""
+    """Protocol of the further attributes that are read from a dataset of rasterio."""
 
     driver: str
     block_shapes: list[tuple[int, int]]
@@ -113,7 +113,7 @@ def raster_settings() -> AbstractContextManager[object]:
 
 
 def driver_of(path: Path) -> str | None:
-    """Tell the only driver that may read a file, by its first bytes; None for other files than pictures."""
+    """Return the only driver that may read a file, by its first bytes; None if it is no picture."""
     kind, _ = kind_of(path)
     return _DRIVERS.get(kind)
 

@@ -134,7 +134,7 @@ def _warn_of_extremes(extremes: tuple[float, float] | None, decoded: Decoded, pa
 
 
 def warn_of_range(least: float, most: float, path: str | PathLike[str], largest: int = 65535) -> None:
-    """Warn of a picture whose values, from `least` to `most`, take less than a quarter of those up to the `largest`."""
+    """Warn of a picture whose values, `least` to `most`, use less than a quarter of the range to `largest`."""
     if 0 < most - least < largest / 4:
         bits = largest.bit_length()
         warnings.warn(
@@ -563,7 +563,7 @@ def stored_boxes(boxes: Tensor, size: tuple[int, int], orientation: int) -> Tens
 
 
 def upright_boxes(boxes: Tensor, size: tuple[int, int], orientation: int) -> Tensor:
-    """Move boxes in the stored pixels of a picture to where they are once it is turned upright.
+    """Convert boxes from a picture's stored pixels to its pixels after it is turned upright.
 
     Args:
         boxes: `(N, 4)`, `(x1, y1, x2, y2)` in pixels.

@@ -1,4 +1,4 @@
-"""Scans of a JPEG, each of which is a pass over all pixels of the picture: a few bytes can ask for very many."""
+"""Check for JPEG files with too many scans, each of which costs a pass over all pixels."""
 
 import re
 from typing import IO

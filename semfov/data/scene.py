@@ -36,7 +36,7 @@ class Annotation:
     size: tuple[int, int]
 
     def take(self, rows: Tensor) -> "Annotation":
-        """Take some of the objects.
+        """Select objects by index.
 
         Args:
             rows: their numbers, or a boolean `(M,)`.

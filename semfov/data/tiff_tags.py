@@ -60,12 +60,12 @@ class TiffTags:
 
     @classmethod
     def of_image(cls, image: "Image") -> "TiffTags":
-        """Take the tags of the current page of a Pillow image; none where it is no TIFF."""
+        """Read the tags of the current page of a Pillow image; empty if it is no TIFF."""
         return cls(getattr(image, "tag_v2", {}))
 
     @classmethod
     def of_page(cls, page: "TiffPage") -> "TiffTags":
-        """Take the tags of a page of tifffile."""
+        """Read the tags of a page of tifffile."""
         return cls({tag.code: tag.value for tag in page.tags.values()})
 
     @property

@@ -20,7 +20,7 @@ ROWS_AT_ONCE = 64  # of a picture, whose values are converted: more leave the ca
 
 
 def check_white(white: White | None) -> None:
-    """Raise `InputError` for what is no white."""
+    """Raise `InputError` unless the value is a valid `white`."""
     if isinstance(white, str | None) and white in (None, "auto"):
         return
     limits: Sequence[object] = white if isinstance(white, tuple | list) else (0.0, white)
@@ -73,7 +73,7 @@ def black_and_white(white: White, values: Values, nodata: float | None = None) -
 
 
 def between(values: Values, tone: tuple[float, float]) -> NDArray[np.float32]:
-    """Scale values to [0, 1] from black to white, `tone`, and cut what lies outside; NaN is black."""
+    """Scale values so that black is 0 and white is 1, and clip them to [0, 1]; NaN becomes black."""
     black, white = tone
     share = (values.astype(np.float64) - black) / (white - black)
     return np.nan_to_num(share, nan=0.0).clip(0, 1).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Mosaics of files, GDAL's VRT, composed here of what their files show.
+"""Mosaics of files (GDAL's VRT), composed from the pixels of their files.
 
 GDAL's own reader of mosaics opens whatever is named, by any driver. Here a source is a picture in the folder of the
 mosaic or below, read by the driver of its kind, and what a mosaic may say is listed (`semfov.data.vrt_text`).

@@ -110,7 +110,7 @@ class Band:
 
 @dataclass(frozen=True)
 class MosaicText:
-    """What the text of a mosaic says.
+    """The parsed text of a mosaic.
 
     Attributes:
         size: `(width, height)` in pixels.

@@ -122,7 +122,7 @@ def check_no_bands(bands: ChosenBands) -> None:
 
 
 def check_bands(bands: ChosenBands) -> None:
-    """Raise `InputError` for what are no numbers of bands."""
+    """Raise `InputError` unless the values are valid numbers of bands."""
     if bands is None:
         return
     numbers = [*bands] if isinstance(bands, tuple | list) else [bands]

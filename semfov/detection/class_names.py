@@ -81,7 +81,7 @@ def names_in_order(names: Mapping[object, _Name]) -> list[_Name] | None:
 
 
 def without_placeholders(names: Sequence[str]) -> list[str]:
-    """Leave out the names of outputs that do not stand for a class.
+    """Drop the names of outputs that do not represent a class.
 
     >>> without_placeholders(["background", "cat"])
     ['cat']

@@ -418,7 +418,7 @@ def network_digest(network: Darknet) -> str:
 
 
 def parameter_versions(parameters: Sequence[nn.Parameter]) -> tuple[object, ...]:
-    """List what changes whenever parameters do.
+    """List the version counters of parameters, which change whenever a parameter changes.
 
     Args:
         parameters: the parameters.

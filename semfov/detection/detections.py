@@ -153,7 +153,7 @@ class Detections:
         return self._mapped(lambda tensor: tensor[index])
 
     def take(self, rows: slice | Tensor) -> Self:
-        """Take some detections of every image.
+        """Select detections of every image by index.
 
         Args:
             rows: the rows of the detections: their numbers, or a boolean `(L,)`.

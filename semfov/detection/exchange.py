@@ -1,4 +1,4 @@
-"""What detections become in other libraries (Supervision, COCO results), and score vectors of boxes from there."""
+"""Conversion of detections to other libraries (Supervision, COCO results) and back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Feature maps of a look: what a network computes on the way to its boxes, named by their place in it and stride."""
+"""Feature maps of a network, named by their place in the network and their stride."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -147,7 +147,7 @@ def _backbone_end(steps: Sequence[NetworkStep], strides: Mapping[str, int], orde
 
 
 def stride_of(canvas: int, side: int) -> int:
-    """Find the stride of a map: the power of two that is nearest to the canvas pixels for one of its own.
+    """Find the stride of a map: the canvas pixels for each of its pixels, as the nearest power of two.
 
     Args:
         canvas: side of the canvas in pixels.
@@ -160,7 +160,7 @@ def stride_of(canvas: int, side: int) -> int:
 
 
 def choose_layers(layers: Iterable[str] | None, have: Sequence[str], detector: str) -> tuple[str, ...]:
-    """Choose the layers that are asked for.
+    """Choose the requested layers.
 
     Args:
         layers: their names; None for all that a detector names.

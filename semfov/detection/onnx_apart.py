@@ -1,4 +1,4 @@
-"""An open-ended ONNX model in a process of its own, which is ended when a pass takes too long."""
+"""ONNX models that may run without end, in a separate process that is stopped when a pass takes too long."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MODELS: weakref.WeakSet[ModelApart] = weakref.WeakSet()  # all of this process,
 
 
 class ModelApart:
-    """A model that a process of its own runs; a new one is started after one that was ended, or after a fork.
+    """A model in a separate process, which is started again after it was stopped, or after a fork.
 
     Attributes:
         description: what onnxruntime says of the model.
@@ -67,7 +67,7 @@ class ModelApart:
             return outputs
 
     def renew(self) -> None:
-        """Let go, in a fork, of what belongs to its parent: the process, and the turn that a thread there may have."""
+        """Release the parent's process and lock after a fork."""
         self._turn = threading.Lock()
         process = self._process
         self._process = None

@@ -1,4 +1,4 @@
-"""What a pass of an ONNX model takes, told from sizes alone: the bytes of its tensors together, and its work."""
+"""Memory and work of a pass of an ONNX model, estimated from the sizes of its tensors."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class Budget:
         check_data(needed <= most, self.name, expected, f"{needed:,}; give a smaller input_size, or replace the file")
 
     def is_open(self, stored: int) -> bool:
-        """Tell whether nothing in the file says that a pass ends soon.
+        """Tell whether the file sets no limit to the time of a pass, for instance because of loops.
 
         Args:
             stored: bytes of the model's files.

@@ -32,7 +32,7 @@ Sizes = tuple[int | None, ...]
 
 
 def layout_of(sizes: Sequence[int | None]) -> str | None:
-    """Find the order of the dimensions of an input by its three channels.
+    """Find the order of the dimensions of an input: the dimension of size 3 has the channels.
 
     Args:
         sizes: the shape of the input, with None or 0 for open sizes.
@@ -83,7 +83,7 @@ class ImageInput(NamedTuple):
 
     @classmethod
     def of(cls, port: Port) -> ImageInput | None:
-        """Describe an input by what onnxruntime says of it.
+        """Make the description of an input from onnxruntime's.
 
         Args:
             port: its name, shape and type.
@@ -101,7 +101,7 @@ class ImageInput(NamedTuple):
         return cls(port["name"], layout, shape, dtype, takes_bytes)
 
     def arranged(self, images: Tensor) -> Numbers:
-        """Bring images into the form of the input.
+        """Convert images to the order of dimensions and the type of the input.
 
         Args:
             images: `(B, 3, H, W)` on the CPU, in `dtype`; where it takes bytes, from 0 to 255.

@@ -1,4 +1,4 @@
-"""Where the boxes of a pass lie, which shows that a head does not belong to a model."""
+"""Checks of where boxes lie, which show that the wrong head was chosen for a model."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""The program that runs one open-ended ONNX model in a process of its own, and how it is spoken to.
+"""The program that runs one ONNX model in a separate process, and its messages.
 
 No operation of onnxruntime can be stopped from outside. A process can: a clock, started before each pass, ends it
 however busy its operations are, and its memory is limited. The program is run by its file, and imports neither tensors
@@ -36,7 +36,7 @@ _SILENT = "ORT_DISABLE_TELEMETRY"  # read when onnxruntime is imported, which el
 
 
 class Opening(TypedDict):
-    """How a model is opened; as JSON, it is the first message to the program.
+    """Settings for opening a model; as JSON, the first message to the program.
 
     Attributes:
         path: the file; None where the model itself is given.
@@ -75,7 +75,7 @@ class Description(TypedDict):
 
 
 def runtime() -> ModuleType:
-    """Import onnxruntime, which then neither counts nor reports what it is used for.
+    """Import onnxruntime with its telemetry switched off.
 
     Returns:
         The module.

@@ -1,4 +1,4 @@
-"""Which head an ONNX model has, and what to do about a model that none fits."""
+"""Recognition of the head of an ONNX model, and advice if no known head fits."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

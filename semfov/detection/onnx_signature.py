@@ -1,4 +1,4 @@
-"""What an ONNX model shows of its head before it runs: names and shapes of its outputs, classes and metadata."""
+"""Properties of an ONNX model that are known before it runs: names and shapes of outputs, and metadata."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -27,7 +27,7 @@ _COCO_COUNTS = (80, 91)
 
 @dataclass(frozen=True)
 class Rows:
-    """The only output of a model, `(1, rows, columns)`, of which one side are boxes and the other their channels.
+    """The only output of a model, `(1, rows, columns)`: one dimension has boxes, the other their channels.
 
     Attributes:
         sides: `(rows, columns)`.

@@ -44,7 +44,7 @@ class Candidates:
         return best if self.objectness is None else best * self.objectness
 
     def as_checked(self) -> "Candidates":
-        """Say that the boxes are finite, and that the scores lie in [0, 1], so that nobody looks again.
+        """Mark boxes as finite and scores as within [0, 1], so that they are not checked again.
 
         Parts and copies on another device keep it; other numbers in place of some (`dataclasses.replace`) do not.
 
@@ -71,7 +71,7 @@ class Candidates:
         return self if self.boxes.device == device else self._mapped(lambda tensor: tensor.to(device))
 
     def take(self, image: int, index: Tensor) -> "Candidates":
-        """Take some boxes of one image.
+        """Select boxes of one image by index.
 
         Args:
             image: index of the image in the batch.

@@ -212,7 +212,7 @@ WEIGHTS: dict[str, _Weights] = {
 
 
 def weights_path(name: str) -> Path:
-    """Name the place of named weights.
+    """Return the path of named weights.
 
     Args:
         name: their name in `WEIGHTS`.

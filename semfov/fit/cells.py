@@ -1,4 +1,4 @@
-"""Fit what a look says about whole cells, so that the map of all classes is right as often as it says."""
+"""Fit the likelihood of whole cells, so that the map of all classes has calibrated probabilities."""
 
 from collections.abc import Sequence
 
@@ -62,7 +62,7 @@ def mean_map_loss(model: FovealObservationModel, photographs: Sequence[Annotated
 
 
 def fit_cells(model: FovealObservationModel, photographs: Sequence[AnnotatedLooks], *, seed: int = 0) -> None:
-    """Learn what a look says about whole cells (its `log_cell`), in place.
+    """Fit the three numbers of whole cells (`log_cell`) of an observation model, in place.
 
     These are three numbers, the odds of a miss, an exponent, and the weight of background. They minimise the negative
     log of what cells hold (`map_loss`), after 1, 2, 4 and 8 looks in a random order. All else stays.

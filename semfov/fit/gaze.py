@@ -27,7 +27,7 @@ _Pictures = Sequence[Sequence[int]]  # pictures of each group
 
 @dataclass(frozen=True)
 class GazeFit(Settings):
-    """How a model of where people look is fitted.
+    """Settings of the fit of a model of where people look.
 
     Args:
         readouts: number of readouts whose mean is the map.

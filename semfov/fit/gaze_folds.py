@@ -111,7 +111,7 @@ class Fold:
 
 
 class FoldStore:
-    """Models of folds and what is computed of them, in a folder, once for the same data, settings and program."""
+    """Folder of the models of folds and their scores, computed once for the same data, settings and code."""
 
     def __init__(self, folder: Path, what: Mapping[str, object]) -> None:
         self.folder = folder

@@ -1,4 +1,4 @@
-"""Fit the evidence for photographs: whether one holds a class, before and after closer looks, and what an object is."""
+"""Fit the models for photographs: the probabilities of a class in a photograph, and of objects."""
 
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
@@ -255,7 +255,7 @@ def _judged_in_folds(evidence: PhotographEvidence, searches: Sequence[_Photograp
 
 
 def shares_by_frequency(usual: Tensor, pictures: Scenes) -> Tensor:
-    r"""Predict the share π of the searches for each class whose target is there, by its frequency alone.
+    r"""Predict the share π of searches with a present target for each class, by the class frequency alone.
 
     .. math:: \operatorname{logit} \pi_t = b_0 \operatorname{logit} q_t + c_0
 

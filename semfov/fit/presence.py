@@ -1,4 +1,4 @@
-"""Fit whether a picture holds a class, and the thresholds of decisions, to what the beliefs of searches say."""
+"""Fit the probability that a picture holds a class, and the thresholds of decisions, to searches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -26,7 +26,7 @@ _LEAST_SLOPE = 0.1  # of the log odds of cells; those of shipped models are near
 
 @dataclass(frozen=True)
 class BeliefsOfSearches:
-    """What the beliefs of E searches say after each of n looks; no search ends before the last one.
+    """Beliefs of E searches after each of n looks; no search ends before its last look.
 
     Probabilities of cells are those of the belief, which no fit has made true yet (`Presence.of_cells`).
 
@@ -65,7 +65,7 @@ class BeliefsOfSearches:
 
     @classmethod
     def join(cls, parts: Sequence["BeliefsOfSearches"]) -> "BeliefsOfSearches":
-        """Put the searches of several photographs together."""
+        """Concatenate the searches of several photographs."""
         columns = zip(*(part._columns() for part in parts), strict=True)
         return cls(*(torch.cat(of_parts, -1) for of_parts in columns))
 

@@ -1,4 +1,4 @@
-"""Looks at photographs beside what is there: labelled detections, and the classes that cells hold."""
+"""Looks at photographs with their annotations: labelled detections, and the classes of cells."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -132,7 +132,7 @@ def all_cells(
 
 @dataclass(frozen=True)
 class AnnotatedLooks:
-    """Looks at a photograph, and what its cells hold.
+    """Looks at a photograph, and the true classes of its cells.
 
     Attributes:
         photograph: its number.
@@ -162,7 +162,7 @@ def annotated_looks(
     cells: tuple[int, int],
     max_target_area: float | None = None,
 ) -> Iterator[AnnotatedLooks]:
-    """Find what the cells of photographs hold.
+    """Find the true classes of the cells of photographs.
 
     Args:
         scenes: the photographs.

@@ -175,7 +175,7 @@ def _with_odds_of_a_miss(
 
 
 def shares_drawn(scenes: Scenes, config: FitSearchConfig, absent: int | None) -> Tensor:
-    """Compute the share of the searches for each class whose target is there; half a search for and against is added.
+    """Compute for each class the share of searches with a present target, smoothed by half a search of each kind.
 
     Args:
         scenes: the photographs.

@@ -1,4 +1,4 @@
-"""Training of small networks: photographs that are held out, the loop, and what a model tells about it."""
+"""Training of small networks: held-out photographs, the loop, and a record of the training."""
 
 from collections.abc import Callable, Iterable
 from contextlib import closing

@@ -74,7 +74,7 @@ def _as_number(value: object, *, whole: bool) -> float:
 
 @dataclass(frozen=True)
 class Form:
-    """How a value is written on a command line, in a type annotation.
+    """Annotation of a type that says how its value is written on a command line.
 
     Args:
         noun: what the value is, such as `a cell`.

@@ -57,7 +57,7 @@ class ImportStatement(NamedTuple):
 
 
 class Source(NamedTuple):
-    """What a source computes and imports.
+    """Digest and imports of a source.
 
     Attributes:
         digest: sha256 of its syntax tree without docstrings; of its bytes where Python cannot parse it.
@@ -183,5 +183,5 @@ def read_source(file: Path) -> Source:
 
 
 def keep_sources() -> None:
-    """Keep what was read, for later processes."""
+    """Store the digests and imports of sources, for later processes."""
     _kept().write()

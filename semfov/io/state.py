@@ -14,7 +14,7 @@ EXTRA_STATE = "_extra_state"
 
 
 class MovableModule(nn.Module):
-    """Base of modules that refuse what is no device in words of their own."""
+    """Base of modules whose errors for an invalid device name the argument."""
 
     def to(self, *arguments: Any, **options: Any) -> Self:
         """Move or convert the module, as `torch.nn.Module.to` does; what is no device is refused."""

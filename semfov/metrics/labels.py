@@ -12,7 +12,7 @@ from semfov.errors import InputError, check, reason_of, type_of, values_known
 
 
 def as_numbers(values: object, argument: str) -> Tensor:
-    """Take numbers of any common type as a tensor of floats.
+    """Convert numbers of any common type to a tensor of floats.
 
     Args:
         values: a tensor, an array or a list.
@@ -34,7 +34,7 @@ def as_numbers(values: object, argument: str) -> Tensor:
 
 
 def as_outcomes(values: object, argument: str) -> Tensor:
-    """Take outcomes of any common type as booleans.
+    """Convert outcomes of any common type to booleans.
 
     Args:
         values: a tensor, an array or a list.

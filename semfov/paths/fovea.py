@@ -78,7 +78,7 @@ class FoveaLooks:
         stages: Mapping[str, float],
         value: float,
     ) -> FoveaLook:
-        """Add a closer look, after which the belief is what it was before.
+        """Add a closer look, which does not change the belief.
 
         Args:
             cell: cell of the place.

@@ -184,7 +184,7 @@ class GazePrediction(OtherWords):
 
     @property
     def parts(self) -> dict[str, float]:
-        """How much each term changes the density: its divergence, in bits, from the density without the term."""
+        """Effect of each term on the density: divergence, in bits, from the density without the term."""
         log_density = self.cells.log()  # (rows, columns)
         parts = {}
         for name in self.terms:

@@ -69,7 +69,7 @@ def finite_or_none(value: float | None) -> float | None:
 
 
 class LookView(NamedTuple):
-    """What a look showed: pixels `(3, h, w)`, and in pixels of a frame of this size boxes `(L, 4)` and the gaze."""
+    """The view of a look: pixels `(3, h, w)`, and boxes `(L, 4)` and gaze in these pixels."""
 
     pixels: Tensor
     size: tuple[int, int]
@@ -129,7 +129,7 @@ def pixels_in(
 
 
 def shorter_way(steps: _Steps, around: float) -> _Steps:
-    """Take the shorter way round a closed line: steps from -around / 2 to around / 2 that lead to the same place.
+    """Compute the shorter way round a closed line of length `around`, from -around / 2 to around / 2.
 
     >>> shorter_way(np.array([350.0, -10.0]), 360).tolist()
     [-10.0, -10.0]

@@ -164,7 +164,7 @@ class Outcome(ABC):
         return None if self.target is None else self.classes[self.target]
 
     def probability_at(self, prior: float) -> float:
-        r"""Give the probability of the decision for another share of pictures that hold the target.
+        r"""Return the probability of the decision for another share of pictures that hold the target.
 
         .. math:: \operatorname{logit} P' = \operatorname{logit} P + \operatorname{logit} \pi
                   - \operatorname{logit} \pi_{\mathrm{assumed}}
@@ -204,7 +204,7 @@ class Outcome(ABC):
 
     @property
     def verdict(self) -> str:
-        """What a search decided: `found`, `absent` or `undecided`; empty where nothing was decided."""
+        """Decision of a search: `found`, `absent` or `undecided`; empty without a decision."""
         return "" if self.decision is None else self.decision.outcome
 
     @property
@@ -303,7 +303,7 @@ class Outcome(ABC):
 
     @property
     def sought(self) -> tuple[int, ...]:
-        """Classes that were searched for; none stands for all."""
+        """Classes that were searched for; empty if for all."""
         return sought_classes(self.target, self.targets)
 
     @property

@@ -519,7 +519,7 @@ class FoveaMoment(_CellRecord, Moment):
         return torch.tensor(self.looks[0].fixation, dtype=self.probability.dtype)
 
     def belief_map(self, index: int) -> tuple[Grid, Tensor]:
-        """Give the probability of the target, or of any object, in each cell."""
+        """Return the probability of the target, or of any object, in each cell."""
         self._place(index)
         return self.grid, self.probability
 

@@ -21,7 +21,7 @@ _SHORTEST = 60  # milliseconds of a fixation, by which the number of fixations i
 
 
 class AreaVisits(NamedTuple):
-    """How many viewers see an area, and when.
+    """Number of viewers who see an area, and when they first see it.
 
     Attributes:
         viewers: share of the viewers with at least one fixation in the area.
@@ -86,7 +86,7 @@ def drawn_starts(
     people: int,
     generator: torch.Generator,
 ) -> Tensor:
-    r"""Draw the first fixation of each viewer: near the middle, and there where people look in this picture.
+    r"""Sample the first fixation of each viewer, near the middle and where people look in this picture.
 
     .. math:: p_1(u) \propto p(u) \, e^{-z(u)^2 / 2}
 
@@ -125,7 +125,7 @@ def _centres(cells: int) -> Tensor:
 def drawn_durations(
     model: FixationDensity, people: int, seconds: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Draw durations of fixations in milliseconds, and count those that begin in the time.
+    """Sample durations of fixations in milliseconds, and count the fixations that begin within the time.
 
     Durations are log-normal; the last distribution of the model stands for all later fixations, too.
 

@@ -92,7 +92,7 @@ class WindowWords(Words):
 
     @property
     def decided_by(self) -> str:
-        """What the number of the decision is: a `probability`, or the best `score` where nothing was learned."""
+        """Kind of number of the decision: a `probability`, or without fitted models the best `score`."""
         return "probability" if self.record.closer or self.record.ending == "decision" else self.measure
 
     def describe(self) -> str:
@@ -305,7 +305,7 @@ class ZoomPath(Record):
 
     @property
     def window_looks(self) -> tuple[WindowLook, ...]:
-        """What each look shows; in a path from a file without gist."""
+        """The results of all looks; in a path from a file they have no gist."""
         return tuple(look.shown for look in self.looks)
 
     @property

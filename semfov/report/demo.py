@@ -20,7 +20,7 @@ _QUALITY = 85  # of a film
 
 
 class DemoPart(NamedTuple):
-    """What the page shows of a task.
+    """The part of the page for one task.
 
     Attributes:
         heading: the task, as a question or a few words.

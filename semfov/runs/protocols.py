@@ -51,7 +51,7 @@ def episodes_of(
     protocol: ProtocolConfig,
     targets: Sequence[int] | None = None,
 ) -> list[Trial]:
-    """Draw all searches of one scene: `starts` for every target, from cells that no object of it overlaps.
+    """List all searches of one scene: `starts` for every target, from random cells without the target.
 
     Args:
         scenes: the scenes.
@@ -112,7 +112,7 @@ def choose_classes(
     seed: int,
     absent: int | None = None,
 ) -> list[int]:
-    """Draw target classes for a photograph: some that it holds, and some that it does not hold.
+    """Choose target classes for a photograph at random: some that it holds, and some that it does not.
 
     Args:
         scenes: the photographs.

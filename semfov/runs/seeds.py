@@ -22,7 +22,7 @@ def generator_for(*purpose: object) -> torch.Generator:
 
 
 def noise_for(protocol: ProtocolConfig, cells: int, *episode: object) -> Tensor:
-    """Draw random numbers for the ties of an episode.
+    """Sample random numbers that break the ties of an episode.
 
     Args:
         protocol: the protocol of the run.

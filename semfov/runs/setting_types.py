@@ -41,7 +41,7 @@ class SettingType:
         return []
 
     def expected(self) -> str | None:
-        """Say what a value must be; None for types that need more words."""
+        """Describe what a value must be; None for types that need more words."""
         return "the name of a file or folder" if self.hint is Path else NOUNS.get(self.hint)
 
 

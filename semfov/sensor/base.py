@@ -90,7 +90,7 @@ class Sensor(StatedModule, ABC):
         """
 
     def canvas_size(self, size: tuple[int, int], reference: float) -> tuple[int, int] | None:
-        """Tell the size of the canvas that the sensor takes.
+        """Return the size of the canvas for the sensor.
 
         Args:
             size: `(width, height)` of the picture.
@@ -159,7 +159,7 @@ class Sensor(StatedModule, ABC):
 
     @classmethod
     def width(cls, settings: Settings) -> float:
-        """Tell the width of the fovea, in pixels of the image that the settings are for.
+        """Return the width of the fovea, in pixels of the reference image.
 
         Policies that bring the fovea closer use it. A sensor that does not tell counts as wide as `published`.
 

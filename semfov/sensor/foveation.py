@@ -381,7 +381,7 @@ class Foveation(Sensor):
 
     @classmethod
     def width(cls, settings: Settings) -> float:
-        """Tell the width of the fovea, σ."""
+        """Return the width of the fovea, σ."""
         return float(settings["sigma"])
 
     @classmethod

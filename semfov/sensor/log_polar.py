@@ -254,7 +254,7 @@ class LogPolar(Sensor):
 
     @classmethod
     def width(cls, settings: Settings) -> float:
-        """Tell the eccentricity at which acuity is half the acuity at the fixation."""
+        """Return the eccentricity at which acuity is half the acuity at the fixation."""
         return float(settings["fovea"])
 
 

@@ -120,7 +120,7 @@ class MultiScaleFovea(Sensor):
         return windows_at(points, magnifications, (self.side, self.side))
 
     def canvas_size(self, size: tuple[int, int], reference: float) -> tuple[int, int]:
-        """Tell the size of the canvas: that of the picture with its longer side at the reference."""
+        """Return the size of the canvas: the picture's size, scaled so that its longer side is the reference."""
         width, height = (max(1, round(length * reference / max(size))) for length in size)
         return width, height
 
@@ -182,7 +182,7 @@ class MultiScaleFovea(Sensor):
 
     @classmethod
     def width(cls, settings: Settings) -> float:
-        """Tell half the side of the finest crop."""
+        """Return half the side of the finest crop."""
         return float(settings["side"]) / 2
 
     @classmethod

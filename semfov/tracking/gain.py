@@ -1,4 +1,4 @@
-"""What a look at a window brings for objects that move: they are where they are said to be again."""
+"""Value of a look at a window for known objects that may have moved: it finds their places again."""
 
 import numpy as np
 from numpy.typing import NDArray

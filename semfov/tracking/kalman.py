@@ -151,7 +151,7 @@ class Kinematics:
         )
 
     def with_rows(self, rows: NDArray[np.intp], others: "Kinematics") -> "Kinematics":
-        """Put other objects in the places of some.
+        """Replace the objects in given rows.
 
         Args:
             rows: `(M,)`, the places.

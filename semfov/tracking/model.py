@@ -1,4 +1,4 @@
-"""What a tracker assumes of objects that move, and of the looks that show them."""
+"""Model of moving objects, and of the looks that show them, for a tracker."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ _MOST_SCORE = 0.99
 
 @dataclass(frozen=True)
 class TrackingModel:
-    r"""What a tracker assumes of objects, and of looks. Lengths are in sides of the object, the root of its area.
+    r"""Parameters of a tracker. Lengths are in units of an object's side, the root of its area.
 
     A look shows an object that has a side of s pixels on the canvas of the detector with the probability
 

@@ -1,4 +1,4 @@
-"""A tracker of objects of which each look shows some: where they are, and the probability that they are there.
+"""A tracker for looks that show only some objects: places and probabilities of all objects.
 
 tracks ── their boxes are followed, ──► predicted ── a look at a window ──► seen: place, velocity, more probable
           the camera moves, time passes                                     not seen there: less probable
@@ -35,7 +35,7 @@ _ONE_OF_CLASS = Selection(iou=0.5, limit=10**9, per_class=True)  # two objects t
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a look at a window of a frame shows.
+    """Detections of a look at a window of a frame.
 
     Attributes:
         boxes: `(M, 4)`, in pixels of the frame.

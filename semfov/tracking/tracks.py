@@ -91,7 +91,7 @@ class Tracks:
 
     @cached_property
     def standing(self) -> Floats:
-        r"""Probabilities that they stand still, `(N,)`, beside the scene.
+        r"""Probabilities that the objects stand still in the scene, `(N,)`.
 
         The odds for a velocity of zero are those of its density after the looks to that before (Dickey, 1971), with the
         velocity v, its variance :math:`\sigma^2` and that before, :math:`\sigma_0^2`, along each axis:
@@ -112,7 +112,7 @@ class Tracks:
 
     @cached_property
     def place(self) -> Floats:
-        """Where they are, `(N, 2)` in pixels: those that stand still are where they came to rest."""
+        """Places of the objects, `(N, 2)` in pixels; objects that stand still keep the place where they stopped."""
         return np.where(self.moves[:, None], self.kinematics.place, self.rest_place)
 
     @cached_property
@@ -139,12 +139,12 @@ class Tracks:
 
     @property
     def log_odds(self) -> Floats:
-        """Log odds that they exist, `(N,)`: those by the looks, and more for what is seen to move."""
+        """Log odds that the objects exist, `(N,)`, from the looks; objects that visibly move have higher ones."""
         return self.shown_odds + self.missed_odds + self.moving_odds
 
     @cached_property
     def moving_odds(self) -> Floats:
-        r"""What is added to the log odds of objects that are seen to move, `(N,)`.
+        r"""Amounts added to the log odds of objects that visibly move, `(N,)`.
 
         With the probability s that it stands still, which is .2 before an object was seen twice, it is
 
@@ -216,7 +216,7 @@ class Tracks:
         return Tracks(**columns)
 
     def with_rows(self, rows: NDArray[np.intp], others: "Tracks") -> "Tracks":
-        """Put other objects in the places of some.
+        """Replace the objects in given rows.
 
         Args:
             rows: `(M,)`, the places.

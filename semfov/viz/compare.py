@@ -1,4 +1,4 @@
-"""Figure of ways to look at pictures: what each finds over seconds."""
+"""Figure that compares ways to look at pictures: objects found over seconds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MARKERS = ("o", "s", "^")
 
 
 class ComparedPoint(Protocol):
-    """What a way of looking finds with some passes."""
+    """Result of one way of looking with a number of passes."""
 
     @property
     def way(self) -> str: ...

@@ -98,7 +98,7 @@ class Letterbox:
 
 
 def check_sides(name: str, size: object) -> None:
-    """Raise `InputError` for what is no `(width, height)` above 0."""
+    """Raise `InputError` unless the value is a pair `(width, height)` above 0."""
     sides = size if isinstance(size, tuple | list | np.ndarray) else ()
     are_above_0 = all(isinstance(side, Real) and 0 < float(side) < np.inf for side in sides)
     check(len(sides) == 2 and are_above_0, name, "a width and a height above 0", size)
@@ -304,7 +304,7 @@ class Fixations:
         return np.array(letterbox.offset), np.array((letterbox.scale, letterbox.scale))
 
     def first(self, count: int) -> "Fixations":
-        """Take the first fixations.
+        """Select the first fixations.
 
         Args:
             count: number of fixations.
@@ -335,7 +335,7 @@ def inside_frame(points: _Values, sides: NDArray[np.number]) -> NDArray[np.bool_
 
 
 def bare_name(picture: str) -> str:
-    r"""Take the name of a picture without folders, whatever system has written them, and without the suffix.
+    r"""Return the name of a picture without folders (of any operating system) and suffix.
 
     >>> bare_name("C:\\pictures\\1013.jpg"), bare_name("pictures/1013.jpg")
     ('1013', '1013')
