@@ -76,7 +76,7 @@ def check(condition: bool, argument: str, expected: str, got: object) -> None:
 
 
 def check_data(condition: bool, where: object, expected: str, got: object) -> None:
-    """Raise `DataError`, for what is wrong in a file, unless a condition holds.
+    """Raise `DataError` (something in a file is wrong) unless a condition holds.
 
     Args:
         condition: what must hold.

@@ -43,7 +43,7 @@ class _SignalSearch(AcquisitionFunction):
 
 
 class EntropyLimit(_SignalSearch):
-    r"""Entropy limit minimisation: the limit of the expected decrease of the entropy of the target's place by a look.
+    r"""Entropy limit minimisation: expected decrease, by a look, of the entropy of the target's place, in the limit.
 
     .. math:: a(f) = \frac{1}{2} \sum_x q(x) \, d'^2(x, f), \qquad q \propto P(t \in x)
 

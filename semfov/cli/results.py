@@ -27,7 +27,7 @@ STDOUT = Path("-")  # standard output in place of a file of results, which takes
 
 
 def kind_of(path: Path) -> str | None:
-    """Tell the format of a file of results by its name.
+    """Find the format of a result file by its name.
 
     Args:
         path: the file, `STDOUT`, or a folder.

@@ -266,7 +266,7 @@ class Reference(ABC):
 
 
 class SlicesReference(Reference):
-    """The objects that all slices list; pictures are counted."""
+    """Reference from the detector itself: the objects that it finds in all slices."""
 
     def image_of(self, name: str, size: tuple[int, int], file: Path | None) -> Id:
         return len(self.pictures) + 1

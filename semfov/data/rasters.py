@@ -30,7 +30,7 @@ _TIFFS = (".tif", ".tiff")
 
 
 class RasterPicture(LargePicture):
-    """A raster that GDAL reads by windows, coarse ones from the overviews of the file, if it has some.
+    """A raster that GDAL reads by windows, at low magnification from the file's overviews, if any.
 
     Private attributes: `_bands` has the numbers of the bands that are shown, one or three, from 1. `_is_masked` tells
     whether the file has a mask, or an alpha, of all bands.

@@ -161,7 +161,7 @@ class EmbeddedScenes(ComposedScenes):
         return objects.take(objects.labels > 0)
 
     def digest(self, index: int) -> str:
-        """Compute a sha256 of the photograph and the part of it that a scene is.
+        """Compute the sha256 of the photograph in a scene and of the part that the scene shows.
 
         Args:
             index: position of the scene in the set.

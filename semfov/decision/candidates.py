@@ -92,7 +92,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
 
     @abstractmethod
     def see(self, look: LookType) -> None:
-        """Take in a look of the search."""
+        """Update the candidates with a look of the search."""
 
     @property
     @abstractmethod
@@ -142,7 +142,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
         self._examined.append(ExaminedPlace(self._now, boxes, covered))
 
     def record(self, box: Tensor, place: float, presence: float) -> CloseUp:
-        """Keep what the last closer look says.
+        """Store the result of the last closer look.
 
         Args:
             box: `(4,)`, box of the target.
@@ -155,7 +155,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
         return CloseUp(self._fixation, self.target, self.cell(box), box, place, presence, self._index)
 
     def examine(self, candidate: CandidatePlace, detections: Detections) -> tuple[Tensor, Tensor]:
-        """Take in what a look shows closely at a candidate, and dismiss it.
+        """Store the result of a closer look at a candidate, and remove the candidate.
 
         Args:
             candidate: the place.
@@ -179,7 +179,7 @@ class CandidatePlaces(ABC, Generic[LookType]):
         return features, box
 
     def count_look(self, candidate: CandidatePlace) -> None:
-        """Give the look that shows a candidate closely the next number of the search."""
+        """Give a closer look the next number among the looks of the search."""
         self._index = self._next
         self._next += 1
 

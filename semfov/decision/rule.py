@@ -62,7 +62,7 @@ class Decision(OtherWords):
 
 @dataclass(frozen=True)
 class CloseUp:
-    """A closer look at a place that seemed to hold the target, and what it says.
+    """A closer look at a place that seemed to hold the target, and its probabilities.
 
     Attributes:
         fixation: index of the fixation after which it was made, from 0; None for windows.
@@ -85,7 +85,7 @@ class CloseUp:
 
     @property
     def number(self) -> int | None:
-        """Number of the look that it is, as that of a look (`semfov.paths.RecordedLook.number`): the first is 1."""
+        """Number of the closer look among the looks of the search, from 1 (`semfov.paths.RecordedLook.number`)."""
         return None if self.index is None else self.index + 1
 
     @property

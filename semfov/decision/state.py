@@ -1,11 +1,11 @@
-"""What is decided after each look, for all kinds of look (the table in `semfov.decision`)."""
+"""Decisions after each look, for all kinds of look (see the table in `semfov.decision`)."""
 
 from semfov.decision.candidates import CandidatePlace
 from semfov.decision.rule import GO_ON, CloseUp, Decision
 
 
 class DecisionState:
-    """What is known of a decision after each look; the base decides nothing.
+    """Base of decisions that follow the looks of an episode; the base itself decides nothing.
 
     Attributes:
         criterion: what the decision `found` needs, in words; None where nothing is decided.

@@ -41,7 +41,7 @@ class StoppingCriterion(DecisionState):
     ending: Literal["box", "min_gain", "detection", "decision"] = "min_gain"
 
     def see(self, step: Step) -> None:
-        """Take in a fixation."""
+        """Update the criterion with a fixation."""
 
     def end_search(self) -> None:
         """Let no fixation follow; closer looks may come due that are worth a pass at the end."""
@@ -59,7 +59,7 @@ class StoppingCriterion(DecisionState):
 
 
 class AtGoal(StoppingCriterion):
-    """Ends with the gaze on one of given cells, `goal` `(X·Y,)` boolean: the paper's oracle, for one search.
+    """Ends a search when the gaze is on one of the cells `goal` `(X·Y,)`, as in the paper's experiments.
 
     The studies have it for many searches at once (`semfov.runs.protocols.run_episodes`).
     """

@@ -56,7 +56,7 @@ class _JudgedPlace(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """What a closer look says: probabilities that the target is at the place and in the picture, and its box `(4,)`."""
+    """Result of a closer look: probabilities of the target at the place and in the picture, and its box `(4,)`."""
 
     place: float
     presence: float
@@ -64,7 +64,7 @@ class Judgement(NamedTuple):
 
 
 class PlaceVerifier(ABC, Generic[LookType]):
-    r"""Base of what decides one search by looks, and by closer looks at the places that seem to hold the target.
+    r"""Base of classes that decide a search by closer looks at places that seem to hold the target.
 
     It makes no look itself. After each look (`see`) it names the most evident place for a closer look (`candidate`), if
     it is probable enough; `examine` tells it what the closer look shows. The search ends at once with a place that is
@@ -146,7 +146,7 @@ class PlaceVerifier(ABC, Generic[LookType]):
         return candidate._replace(box=moved_box) if bool(is_ahead) else None
 
     def see(self, look: LookType, *, last: bool = False) -> None:
-        """Take in a look of the search, and choose the place that is to be looked at closely."""
+        """Update with a look of the search, and choose the place of the next closer look."""
         self._judged = None
         self.places.see(look)
         if self.places.forgetting.rate:  # in a stream, in which objects move

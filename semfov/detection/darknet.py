@@ -417,7 +417,7 @@ class Darknet(nn.Module):
         return self.run({-1: image}, 0, its_input + 1)[its_input]
 
     def landmarks(self) -> dict[str, int]:
-        """Name maps by their place (`semfov.detection.feature_maps`).
+        """List the names of feature maps by their place in the network (`semfov.detection.feature_maps`).
 
         Returns:
             Numbers of their layers, by name.

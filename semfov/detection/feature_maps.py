@@ -61,7 +61,7 @@ class NetworkStep(NamedTuple):
 
 
 def landmarks(steps: Sequence[NetworkStep]) -> dict[str, str]:
-    """Name maps by their place in the structure of a network: `backbone8`, `head8`, ….
+    """List the names of feature maps by their place in a network: `backbone8`, `head8`, ….
 
     `backbone` is the first map of a stride that a coarser one is computed from (the coarsest: that a finer one is).
     `head` is the last map that two convolutions read, else the last that one reads, of those that are computed after

@@ -59,7 +59,7 @@ def cell_count(canvas: Canvas, strides: Sequence[int]) -> int:
 
 
 def box_counts(canvas: Canvas) -> dict[int, CellBoxes]:
-    """List the numbers of boxes that heads with cells have on a canvas.
+    """List the possible numbers of boxes on a canvas, for each kind of head that has boxes in cells.
 
     Args:
         canvas: `(width, height)` in pixels.

@@ -149,7 +149,7 @@ def query_logits(outputs: Mapping[str, _Output]) -> _Output:
 
 
 def selected_outputs(outputs: Mapping[str, _Output]) -> dict[str, _Output]:
-    """Name the outputs of a network that selects boxes itself by what they are.
+    """Find which output has boxes, scores or classes, for a network that selects boxes itself.
 
     Args:
         outputs: the outputs, or their shapes, by the names of the exporter.

@@ -63,7 +63,7 @@ def descend(
     rise: float = 0.3,
     title: str = "training",
 ) -> None:
-    """Train with AdamW and one cycle of the rate (Smith and Topin, 2019).
+    """Train with AdamW and a one-cycle learning rate (Smith and Topin, 2019).
 
     Args:
         parameters: parameters, or groups of them with their own options, as for an optimiser.

@@ -1,4 +1,4 @@
-"""Settings of modules in their state, so that the state of a module with other settings is refused."""
+"""Modules whose state includes their settings, so that a state with other settings raises an error."""
 
 import json
 from collections.abc import Mapping

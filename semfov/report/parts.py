@@ -86,7 +86,7 @@ class Part(ABC):
 
     @property
     def section_html(self) -> str:
-        """Its section with objects below what the script draws; empty where its article has them."""
+        """HTML section with the part's objects; empty if they are already in the part's article."""
         return ""
 
     @abstractmethod

@@ -275,7 +275,7 @@ WHERE = ("out", "cache", "workers", "scheduler")  # settings of folders and proc
 
 
 class EyeSettings(Protocol):
-    """Settings of an eye and of the scenes that it looks at, as an `EyeConfig` and those of single fits have them."""
+    """Protocol of settings of an eye and its scenes: an `EyeConfig`, or the settings of a fit."""
 
     @property
     def data(self) -> DataConfig:
