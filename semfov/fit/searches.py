@@ -1,10 +1,9 @@
 """Searches that a verification is fitted to; all searches of a photograph share its looks, each made only once."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Generic, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,14 +12,11 @@ from semfov.belief.grid import Grid
 from semfov.belief.observers import SemanticSearch
 from semfov.decision import (
     FOUND,
-    MOST_CLOSER,
     CandidateCells,
-    CandidatePlaces,
     cell_of,
     decide,
     decision_without_closer_looks,
 )
-from semfov.decision.candidates import LookType
 from semfov.detection.detections import Detections
 from semfov.episode import Step, rollout
 from semfov.fit.settings import VerificationConfig
@@ -44,50 +40,6 @@ class SearchEnd(NamedTuple):
 
     right: bool | None
     looks: int
-
-
-class TargetSearch(ABC, Generic[LookType]):
-    """Base of the searches for a class in a picture, with all their looks: decisions do not move the gaze.
-
-    Attributes:
-        after: numbers of looks after which places are examined for the fit.
-        most: largest number of closer looks.
-        picture: number of the picture among those of the fit.
-        target: the class, 1..K.
-        present: whether the picture holds the class.
-        spare: whether the search serves only to choose thresholds.
-    """
-
-    after: ClassVar[tuple[int, ...]]
-    most: ClassVar[int] = MOST_CLOSER
-    picture: int
-    target: int
-    present: bool
-    spare: bool = False
-
-    @abstractmethod
-    def __len__(self) -> int:
-        """Count the looks, without closer looks."""
-
-    @abstractmethod
-    def look(self, index: int, number: int) -> LookType:
-        """Return the look of this index; `number` looks of both kinds were made up to it."""
-
-    @abstractmethod
-    def candidates(self) -> CandidatePlaces[LookType]:
-        """Make the places that seem to hold the target, before any look."""
-
-    @abstractmethod
-    def close_up(self, box: Tensor) -> Detections:
-        """Look closely at a box `(4,)`."""
-
-    @abstractmethod
-    def right(self, box: Tensor) -> bool:
-        """Tell whether the target is at a box `(4,)`."""
-
-    def unverified(self) -> SearchEnd | None:
-        """Return the end of the search without closer looks, where the belief alone can decide; None elsewhere."""
-        return None
 
 
 @dataclass(frozen=True)
@@ -143,8 +95,18 @@ def open_photographs(
     return photographs
 
 
-class _PhotographSearch(TargetSearch[Step]):
-    """A search of a photograph, where the class is most probable; it assumes how often the class is searched for."""
+class TargetSearch:
+    """A search of a photograph, with all its looks where the class is most probable: decisions do not move the gaze.
+
+    It assumes how often the class is searched for.
+
+    Attributes:
+        after: numbers of looks after which places are examined for the fit.
+        picture: number of the photograph among those of the fit.
+        target: the class, 1..K.
+        present: whether the photograph holds the class.
+        spare: whether the search serves only to choose thresholds.
+    """
 
     after = (1, 3, 5, 8, 12)
 
@@ -172,16 +134,12 @@ class _PhotographSearch(TargetSearch[Step]):
         policy = TargetPosterior(self.target)
         return list(rollout(source, self.observer, policy, self.search.start, choice, most=self.most_looks))
 
-    def __len__(self) -> int:
-        return len(self.steps)
-
-    def look(self, index: int, number: int) -> Step:
-        return self.steps[index]
-
     def candidates(self) -> CandidateCells:
+        """Make the places that seem to hold the target, before any look."""
         return CandidateCells(self.photograph.grid, self.target, prior=self.observer.prior)
 
     def close_up(self, box: Tensor) -> Detections:
+        """Look closely at a box `(4,)`."""
         return self.photograph.looks(tuple(box.tolist()))
 
     def right(self, box: Tensor) -> bool:
@@ -189,7 +147,10 @@ class _PhotographSearch(TargetSearch[Step]):
         return bool(self.search.goal[cell_of(box, self.photograph.grid)])
 
     def unverified(self) -> SearchEnd | None:
-        """Decide by the thresholds of the model; the place is right if an object overlaps the cell of the decision."""
+        """Decide without closer looks, by the thresholds of the model; None without these.
+
+        The place is right if an object overlaps the cell of the decision.
+        """
         if self.thresholds is None:
             return None
         for index, step in enumerate(self.steps):
@@ -200,12 +161,12 @@ class _PhotographSearch(TargetSearch[Step]):
                 return SearchEnd(bool(self.search.goal[decision.cell]), index + 1)
             if outcome:
                 return SearchEnd(None, index + 1)
-        return SearchEnd(None, len(self))
+        return SearchEnd(None, len(self.steps))
 
 
 def photograph_searches(
     photographs: Sequence[SearchedPhotograph], model: FovealObservationModel, looks: int, title: str
-) -> Iterator[_PhotographSearch]:
+) -> Iterator[TargetSearch]:
     """Search photographs for all their classes; after the searches of one, its looks are stored and freed.
 
     Args:
@@ -219,5 +180,5 @@ def photograph_searches(
     """
     for photograph in track(photographs, title, "photograph"):
         for search in photograph.targets:
-            yield _PhotographSearch(photograph, search, model, looks)
+            yield TargetSearch(photograph, search, model, looks)
         photograph.looks.close()

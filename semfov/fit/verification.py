@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from semfov.belief.prior import with_prior
 from semfov.belief.verification import CLOSER_FEATURES, Verification
 from semfov.decision import FOUND, Verifier, final_outcome, found_at_once
-from semfov.decision.candidates import CandidatePlace, LookType
+from semfov.decision.candidates import CandidatePlace
 from semfov.detection.detections import Detections
 from semfov.errors import DataError
 from semfov.fit.logistic import logistic_regression
@@ -152,8 +152,8 @@ def fit_in_folds(
 
 
 def fit_verification(
-    first: Iterable[TargetSearch[LookType]],
-    again: Iterable[TargetSearch[LookType]],
+    first: Iterable[TargetSearch],
+    again: Iterable[TargetSearch],
     folds: int,
     limits: Thresholds,
     false_alarms: float,
@@ -190,7 +190,7 @@ def fit_verification(
 
 
 @torch.inference_mode()
-def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> CloserLookSamples:
+def examine(searches: Iterable[TargetSearch], folds: int = 1) -> CloserLookSamples:
     """Look closely at the most evident places of every search.
 
     Args:
@@ -224,7 +224,7 @@ def examine(searches: Iterable[TargetSearch[LookType]], folds: int = 1) -> Close
     return CloserLookSamples(torch.stack(features), *answers, torch.tensor(fold), torch.tensor(known))
 
 
-def examined_places(search: TargetSearch[LookType]) -> Iterator[ExaminedLook]:
+def examined_places(search: TargetSearch) -> Iterator[ExaminedLook]:
     """Look closely at the most evident places after some numbers of looks.
 
     Args:
@@ -235,11 +235,11 @@ def examined_places(search: TargetSearch[LookType]) -> Iterator[ExaminedLook]:
     """
     least = Thresholds(confirm=1.0, stop_below=_LEAST_CHANCE, place=_LEAST_CHANCE)
     for looks in search.after:
-        if looks > len(search):
+        if looks > len(search.steps):
             return
         candidates = search.candidates()
-        for index in range(looks):
-            candidates.see(search.look(index, index + 1))
+        for step in search.steps[:looks]:
+            candidates.see(step)
         for _ in range(_PLACES):
             candidate = candidates.due(least, last=True)
             if candidate is None:
@@ -250,7 +250,7 @@ def examined_places(search: TargetSearch[LookType]) -> Iterator[ExaminedLook]:
 
 @torch.inference_mode()
 def verify(
-    searches: Iterable[TargetSearch[LookType]],
+    searches: Iterable[TargetSearch],
     folds: Sequence[Verification],
     limits: Thresholds,
 ) -> Iterator[VerifiedSearch]:
@@ -269,15 +269,15 @@ def verify(
         yield _verify_search(search, folds[search.picture % len(folds)], limits)
 
 
-def _verify_search(search: TargetSearch[LookType], model: Verification, limits: Thresholds) -> VerifiedSearch:
+def _verify_search(search: TargetSearch, model: Verification, limits: Thresholds) -> VerifiedSearch:
     """Make all closer looks of a search, and decide it without them."""
     places = search.candidates()
-    verifier = Verifier(model, places, limits, search.most)
+    verifier = Verifier(model, places, limits)
     looks = 0
     ends: list[int] = []
-    for index in range(len(search)):
+    for number, step in enumerate(search.steps, 1):
         looks += 1
-        verifier.see(search.look(index, looks), last=index + 1 == len(search))
+        verifier.see(step, last=number == len(search.steps))
         for _ in verifier.look_closely(search.close_up):
             looks += 1
             ends.append(looks)

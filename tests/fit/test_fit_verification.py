@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from semfov import ActivePerception, DataError, EmbeddedScenes, Eye, FovealObservationModel, Foveation
 from semfov.belief import Verification
 from semfov.belief.observers import Semantic, SemanticSearch
-from semfov.fit.searches import SearchEnd, _PhotographSearch, open_photographs, photograph_searches
+from semfov.fit.searches import SearchEnd, TargetSearch, open_photographs, photograph_searches
 from semfov.fit.settings import VerificationConfig
 from semfov.fit.verification import (
     _LEVELS,
@@ -98,8 +98,10 @@ def test_with_more_closer_looks_the_fit_moves_from_the_prior_to_the_fit_without(
 
 
 def shipped():
-    """The centre of the prior."""
-    return Verification.from_pretrained(_SHIPPED)
+    """The centre of the prior, without the thresholds and the detector of the file."""
+    model = Verification()
+    model.linear.load_state_dict(Verification.from_pretrained(_SHIPPED).linear.state_dict())
+    return model.eval().requires_grad_(False)
 
 
 def examined_in(seen, searching, config):
@@ -201,7 +203,7 @@ def test_looks_from_a_store_equal_those_of_the_eye(tmp_path):
 
 def steps_of(photographs, searching):
     """All looks of all searches of photographs."""
-    searches = (_PhotographSearch(each, sought, searching, 5) for each in photographs for sought in each.targets)
+    searches = (TargetSearch(each, sought, searching, 5) for each in photographs for sought in each.targets)
     return [step for search in searches for step in search.steps]
 
 
