@@ -204,7 +204,8 @@ class FindSettings(LookSettings):
             by windows, whatever it is.
         score_threshold: probability from which on an object is listed in windows (None: 0.5); without fitted models and
             otherwise its score (None: 0.3).
-        batch: number of windows that are chosen jointly and pass the detector together.
+        batch: number of windows that are chosen jointly and pass the detector together. It counts in large pictures
+            with fitted models alone, and means nothing in photographs, for a fovea and for a head.
 
     Raises:
         InputError: a value is out of range, or the kind of look is unknown.

@@ -64,7 +64,9 @@ class WindowTask:
         decisions: settings of the decision of a search.
         min_gain: an exploration ends when no look is expected to find more new objects than this; None for the usual
             number. In a photograph, and without evidence, all slices are looked at, and it means nothing.
-        batch: number of windows that are chosen jointly and pass the detector together; in a photograph one.
+        batch: number of windows that are chosen jointly (`semfov.zoom.policy.jointly`) and pass the detector together.
+            It counts where all objects of a large picture are found with evidence; else there is one at a time: in a
+            search, in a photograph, and in slices.
         score_threshold: probability, without evidence score, from which on objects count; None for the usual one.
         detector: name of the detector; None if it is not known.
         usual_score: score from which on objects count where neither evidence nor `score_threshold` says it

@@ -59,8 +59,10 @@ presence does (`settle`):
                                  with the passes that remain; it is over
     compared by, with closer     `Verifier.outcome` of `CandidateCells`  `ObjectVerifier.outcome` of `ObjectPlaces`
     looks
-    compared by, without         `decide`                                `settle`, called by `DecisionsByPresence`
+    compared by, without         `settle`, called by `decide`            `settle`, called by `DecisionsByPresence`
     closer looks
+    `settle` is called, too,     by a head (`semfov.agents.head`), and by the fit, to choose thresholds
+                                 (`semfov.fit.thresholds`)
     outcome, if over             found with a place, or presence, from confirm on; else absent if presence < 1/2, else
                                  undecided
     outcome, if not over         found on the same terms, else undecided

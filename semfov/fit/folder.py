@@ -13,6 +13,9 @@
 A part is fitted again if its settings, the detector, the sensor, the photographs, a part before it, any code of the
 package or the version of a library changed. Looks are made again for another detector, sensor, grid or photograph, or
 with another version of a library. Of code, they depend only on what looking imports (`semfov.io.code`).
+
+A part that could not be fitted is stored and read like one that was, so that the same command does not try it again. To
+try it again with nothing changed, delete `progress/NAME.json` in the model folder; there is no option for it.
 """
 
 import json
@@ -69,7 +72,7 @@ class FolderFit:
             name: name of the part; those before it are finished.
 
         Returns:
-            The part. One that cannot be fitted has the reason.
+            The part. One that cannot be fitted has the reason, and is read from the folder the next time, too.
         """
         key = self._key(name)
         file = self.inputs.config.out / "progress" / f"{name}.json"
@@ -99,7 +102,7 @@ class FolderFit:
         return digest_of([self.inputs.run.key, [name, relevant, self.inputs.config.judged, before]])
 
     def _read_result(self, file: Path, key: str) -> PartResult | None:
-        """Read what an earlier run wrote of a part; None unless it is complete and has this key."""
+        """Read what an earlier run wrote of a part, also a failure; None unless it is complete and has this key."""
         out = self.inputs.config.out
         with suppress(Exception):  # a damaged record is no problem, as the part can be fitted again
             record = json.loads(file.read_text(encoding="utf-8"))

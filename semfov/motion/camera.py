@@ -26,7 +26,7 @@ from semfov.motion.patches import PatchFlow
 from semfov.motion.residual import coarse_shift, share_off, whole_shift
 
 _STILL = np.eye(3)
-_STILL_SHIFT = 0.3  # pixels of the frame: a camera that moves less stands still
+_STILL_SHIFT = 0.3  # pixels of the frame: a camera that has moved less since its last reported motion stands still
 _LEAST_IN_VIEW = 0.6  # share of a key frame in view below which there is a new one
 
 _NO_SHIFT = 0.03  # reduced pixels by which a whole frame moves at most where a camera begins to stand before a pattern
@@ -69,6 +69,9 @@ class CameraStep(NamedTuple):
 
 class KnownPoses:
     """Motion of a camera from known poses: of a gimbal, a head, or a robot's odometry.
+
+    With known poses no scene is ever lost: from the second frame on each step has a motion, and none waits, recovers or
+    gives up. A stream with poses is thus never `lost`, also where the frames show something else.
 
     >>> camera = KnownPoses()
     >>> camera.step([[1, 0, 0], [0, 1, 0]]).motion is None
@@ -167,6 +170,9 @@ class CameraMotion:
     A doubted motion is none. The next frames are then compared with the key frame before it, too, for `patience`
     frames, so that a short disturbance loses nothing.
 
+    A motion of less than 0.3 px of the frame (`_STILL_SHIFT`) is none. A slow drift is not lost by that: the key frame
+    stays as it is, so that against it the drift adds up, and it is reported in steps of about 0.3 px.
+
     A similarity describes a scene that is flat or far away. Parallax of near objects counts as their own motion: the
     first frames behind them are doubted.
 
@@ -247,13 +253,16 @@ class CameraMotion:
         self._scene = scene._replace(last=present)  # stays so where the camera stands still
         has_stood = self._stands_still
         if has_stood and not scene.has_moved and self._stays(scene, present):
+            # A camera that stood, and nearly all corners are where the key frame has them: told without a fit.
             return Motion.still()
         scene_of_fit, fit = self._fit_to_key_or_last(scene, present)
         self._stands_still = not scene.has_moved and self._shows_no_drift(scene.key, present, fit, has_stood=has_stood)
         if self._stands_still:
+            # No motion or several fit, as before stripes, but all texture is where the key frame has it.
             return Motion.still()
         if fit is None:
             self._scene = _Scene.of(present)
+            # Nothing can be followed, as in the dark, but the frame is the same; a slow drift is not seen here.
             return Motion.still() if self._is_same(scene.last, present) else None
         return self._by_fit(scene_of_fit, present, fit, has_stood=has_stood)
 
@@ -284,7 +293,8 @@ class CameraMotion:
             return None
         self._course = since_last.similarity
         if is_still:
-            # The motion to the last frame stays as it was: noise of a camera that stands would add up.
+            # A motion was fitted but is too small. With `key_to_last` as it was, noise of a still camera does not
+            # add up, but a slow drift does, until it is large enough.
             self._scene = scene._replace(last=present)
             self._stands_still = True
             return Motion.still()

@@ -22,6 +22,8 @@ _STEPS = (
 def article_html(data: Data, place: str, objects: str, facts: Mapping[str, str], *, is_named: bool) -> str:
     """Make the article of a record: the picture with its objects and windows, the list of the objects, and all looks.
 
+    It embeds its pictures, also those that another article of the page has.
+
     Args:
         data: data of the record (`semfov.report.zoom.zoom_data`).
         place: id of the article.

@@ -80,7 +80,11 @@ def page_html(title: str, episodes: Sequence[Data], *, sections: str = "", total
 
 
 def _script_data(parts: Sequence[Part]) -> Data:
-    """Collect what the script of a page reads; each picture is in it once, also where several episodes show it."""
+    """Collect what the script of a page reads; each picture of the episodes that it draws is in it once.
+
+    Articles of windows and of heads embed their pictures in the markup, each a copy, and have none here
+    (`semfov.report.looks`).
+    """
     numbers: dict[str, int] = {}
     for part in parts:
         for uri in part.pictures:

@@ -73,7 +73,7 @@ class Part(ABC):
 
     @property
     def pictures(self) -> list[str]:
-        """Pictures that the script draws, as data URIs."""
+        """Pictures that the script draws, as data URIs; none for looks, as their article embeds its own copies."""
         return []
 
     def looks_html(self, *, is_named: bool) -> str:

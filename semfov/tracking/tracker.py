@@ -41,7 +41,7 @@ class Seen:
         boxes: `(M, 4)`, in pixels of the frame.
         scores: `(M,)`, from 0 to 1.
         labels: `(M,)`, classes 1..K.
-        cut: `(M,)` boolean, whether the border of the window cuts a box.
+        cut: `(M,)` boolean, whether the border of the window cuts a box where the frame goes on beyond it.
         region: `(x1, y1, x2, y2)`, the window in pixels of the frame.
         magnification: canvas pixels for a pixel of the frame.
         number: number of the look.
@@ -203,6 +203,10 @@ class Tracker:
 
     def see(self, seen: Seen) -> None:
         """Update the objects by a look at the present frame.
+
+        A box that the border of the window cuts (`Seen.cut`) keeps its object from a miss, but does not update it, and
+        begins none: another window may show all of it. One that only the border of the frame cuts (`Seen.entering`)
+        updates or begins an object, as no window shows more of it now, but leaves the size open for the next look.
 
         Args:
             seen: what the look shows.

@@ -153,6 +153,7 @@ class _Recent(Generic[_Belief]):
         self.kept: list[KeptLook] = []
         self.lost: LostScene[KeptLook] = LostScene()
         self.windows: set[Window] = set()
+        # Set by `_forget` at each look of a stream; read by `_next_choices`, which then chooses the overview.
         self.lacks_overview = False
         self.step: WindowStep[_Belief] | None = None
 
@@ -317,7 +318,8 @@ def find_everything(
 ) -> Iterator[WindowStep[ZoomBelief]]:
     """Look for all objects of one class, or of every class, until no look is expected to find enough.
 
-    `known` gives by level what a look at each window brings for objects that are known.
+    Up to `batch` windows are chosen jointly and looked at together; no other episode has such batches. `known` gives by
+    level what a look at each window brings for objects that are known.
     """
     belief = ZoomBelief(source.lattice, evidence, target or 0, source.blank)
 

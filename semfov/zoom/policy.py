@@ -97,6 +97,8 @@ def jointly(
 ) -> list[WindowChoice]:
     """Choose several windows for one batch, each as if the windows chosen before it had been looked at.
 
+    Only `find_everything` calls it, with `batch` as the count: searches and slices choose one window at a time.
+
     Args:
         choose: chooses one window by the belief, given those that were looked at.
         belief: the belief; it is unchanged afterwards.
