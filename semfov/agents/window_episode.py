@@ -87,7 +87,10 @@ class WindowTask:
             Prior.of(self.decisions.prior, None)  # without evidence there is no probability
 
     def takes_slices(self, lattice: Lattice) -> bool:
-        """Whether the agent looks at slices, ordered by the overview's scores, because no belief chooses windows."""
+        """Tell whether the agent looks at slices, in the order of their scores in the first look at the whole picture.
+
+        It does so without evidence, and in a photograph if it does not search; otherwise a belief chooses its windows.
+        """
         return self.evidence is None or (lattice.levels == 1 and not self.goal.searches)
 
 

@@ -63,7 +63,7 @@ class Conversion(Outcome, OtherWords):
         return self._words(self)
 
     def describe(self) -> str:
-        """Describe the outcome in one line.
+        """Say in one line what a search decided, or which objects the looks found.
 
         Returns:
             The line.

@@ -362,7 +362,7 @@ class HeadPath(Record):
         return torch.tensor([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
 
     def belief_map(self, index: int) -> tuple[Grid, Tensor]:
-        """Probability of the target, or of any object, in each cell of the scene after a look."""
+        """Return the cells of the scene, and the probability of the target, or of any object, in each after a look."""
         return self.views.world.scene, self.maps[self._place(index)]
 
     def look_views(self, source: LargePicture) -> Iterator[LookView]:

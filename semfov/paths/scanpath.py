@@ -298,7 +298,7 @@ class Scanpath(_CellRecord):
         return sum(not look.is_closer for look in self.looks[: self._place(index) + 1]) - 1
 
     def belief_map(self, index: int) -> tuple[Grid, Tensor]:
-        """Probability in each cell after a look: of the target by the belief of the search, or of any object."""
+        """Return the grid, and in each cell the probability, after a look, of the target or the likeliest class."""
         fixation = self.fixation_after(index)
         if self.target is None:
             # Class 0 is the background.

@@ -110,7 +110,7 @@ class WindowStep(Generic[_StepBelief_co]):
 
     @property
     def look(self) -> WindowLook:
-        """The look, as it was taken."""
+        """The look of this step, in pixels of the frame in which it was taken."""
         return self.newest.original
 
     @property

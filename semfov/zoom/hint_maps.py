@@ -59,7 +59,7 @@ def hint_maps(hints: Tensor, best: Tensor, detections: Tensor, size: Tensor, cro
 
 
 def memory_maps(like: Tensor, before: Tensor | None) -> list[Tensor]:
-    """Compute the inputs of a network about earlier, coarser looks: their prediction for each cell, if any.
+    """Make two inputs of a network: what an earlier, coarser look predicted for each cell, and whether there was one.
 
     Args:
         like: `(T, rows, columns)`, gives shape, type and device.

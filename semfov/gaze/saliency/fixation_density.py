@@ -249,7 +249,7 @@ class FixationDensity(Pretrained):
     def readouts(
         self, features: FeatureMaps | Mapping[str, Tensor], size: tuple[int, int], read: Tensor | None = None
     ) -> Tensor:
-        """Compute the readouts, whose blurred mean is the map.
+        """Compute what R small networks read from the feature maps (readouts); their blurred mean is the map m.
 
         Args:
             features: as for `forward`.
