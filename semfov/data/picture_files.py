@@ -81,7 +81,8 @@ def _warn_of_omitted(where: object, paths: Collection[Path], noun: str, why: str
     """
     if paths:
         names = printable(", ".join(map(str, sorted(paths)[:_NAMED])))
-        warnings.warn(f"{where}: {amount(len(paths), noun)} left out, {why}: {names}", stacklevel=3)
+        few = "such as " if len(paths) > _NAMED else ""
+        warnings.warn(f"{where}: {amount(len(paths), noun)} left out, {why}: {few}{names}", stacklevel=3)
 
 
 def _is_hidden(path: Path) -> bool:

@@ -68,8 +68,8 @@ class CloseUp:
         fixation: index of the fixation after which it was made, from 0; None for windows.
         target: class 1..K that was looked for.
         cell: cell that the box covers most, where places are cells.
-        box: box `(4,)` of the target, in a large picture that of the surest object at the place; the examined one where
-            the target is not shown.
+        box: box `(4,)` of the target, by windows that of the surest object at the place; the examined one where the
+            target is not shown.
         place: probability that the target is there, after the look.
         presence: probability that the picture holds the target, after the look.
         index: place of the look that it is in its record, `record[index]`, from 0; None if it is no look of a record.

@@ -23,9 +23,8 @@ class Forgetting:
     What forgets by it:
 
     - the belief of a fovea or a head, by `share_left`: `attend` (`semfov.episode.loop`) calls `Observer.fade`;
-    - probabilities of closer looks, and of a fovea and in photographs scores of looks, by `share_left`, and both as a
-      whole after `span` or a multiple of it (`semfov.decision.candidates`, `semfov.decision.verifier`,
-      `semfov.zoom.closer`);
+    - probabilities of closer looks, and of a fovea scores of looks, by `share_left`, and both as a whole after `span`
+      or a multiple of it (`semfov.decision.candidates`, `semfov.decision.verifier`);
     - that a target was absent, after `span` (`semfov.zoom.decision.LastingAbsence`);
     - detections by which a search decides: after `span` (`semfov.decision.stopping`);
     - looks at windows: after `span`, or when a look replaces them; the look at the whole when it is made anew

@@ -1,7 +1,7 @@
 """Memory of a scene that the camera has lost: kept for some frames, and used if the scene comes back.
 
 What is kept so: looks at windows (`semfov.zoom.episode`, `semfov.agents.window_episode`), candidates and places of
-closer looks (`semfov.decision.candidates`, `semfov.decision.verifier`, `semfov.zoom.closer`), and tracked objects
+closer looks (`semfov.decision.candidates`, `semfov.decision.verifier`), and tracked objects
 (`semfov.tracking.tracker`). A belief by windows is made anew of the looks that are left, with none from a new look at
 the whole.
 """

@@ -23,7 +23,7 @@ from semfov.zoom.hints import DETECTION_SCORE
 from semfov.zoom.looks import Window, WindowLook
 from semfov.zoom.objects import merge_with_facts
 
-_NOTHING = 1e-3  # certainty of an object that looks do not show
+_NOTHING = 1e-3  # certainty of an object that looks do not show, and chance of a hit that is none
 _NONE_LEFT = -1.0  # chance of a hit where no look is left, below a `stop_below` of 0, too: the search is over
 _WHOLE = 0.9  # share of a picture from which on a window shows no more than the look at the whole
 _AS_CLOSE = 0.5  # share of the magnification of a closer look from which on a look places objects about as exactly
@@ -234,10 +234,10 @@ class ObjectPlaces(CandidatePlaces[TargetFacts]):
     def due(self, thresholds: Thresholds, *, last: bool) -> CandidatePlace | None:
         """Take the surest object that was not examined, if it is likely, or at the end as probable as `place`."""
         surest, worth = self._surest()
-        return surest if worth >= max(thresholds.place if last else LIKELY, _NOTHING) else None
+        return surest if worth >= (thresholds.place if last else LIKELY) else None
 
     def _surest(self) -> tuple[CandidatePlace | None, float]:
-        """Find the surest object that was not examined, and the chance of a hit for which it is looked at closely.
+        """Find the surest object that was not examined, if any, and the chance of a hit for which it is looked at.
 
         In a photograph this chance is no larger than that by the prior of the fit: of fainter objects the fit knows
         nothing, however frequent the target is.
@@ -249,8 +249,10 @@ class ObjectPlaces(CandidatePlaces[TargetFacts]):
         surest = int(chances.argmax())
         fitted = float(chances[surest])
         probability = self._with_prior(fitted)
-        place = CandidatePlace(objects.boxes[surest], float(objects.scores[surest]), probability)
-        return place, probability if self._is_large else min(fitted, probability)
+        worth = probability if self._is_large else min(fitted, probability)
+        if worth < _NOTHING:
+            return None, _NONE_LEFT
+        return CandidatePlace(objects.boxes[surest], float(objects.scores[surest]), probability), worth
 
     def object_at(self, box: Tensor) -> tuple[float, Tensor]:
         """Find the surest object at a place.

@@ -451,7 +451,7 @@ def test_a_damaged_picture_does_not_tell_whether_processes_pay(monkeypatch):
     options = SimpleNamespace(workers=None, scheduler=None, quiet=True)
     outcomes = [DataError("a.png: damaged"), "seen", "not asked for here", "nor this"]
     job = SimpleNamespace(several=True, options=options, sources=range(4), outcome=lambda number: outcomes[number])
-    assert [number for number, _ in search._outcomes(job, {})] == [0, 1]
+    assert [number for number, _ in search._outcomes(job, [0, 1, 2, 3])] == [0, 1]
     assert measured == [(None, 2, pytest.approx(4.0), 10.0)]
 
 

@@ -18,7 +18,7 @@ from semfov.data import Annotation, Scene
 from semfov.data.mosaics import Mosaics
 from semfov.errors import DataError
 from semfov.fit.folder import FolderFit
-from semfov.fit.photographs import _explored, _fit_places, fit_photographs
+from semfov.fit.photographs import LEAST_CERTAINTY, _explored, _fit_places, fit_photographs
 from semfov.fit.settings import FitDetectorConfig
 from semfov.fit.windows import MosaicFit
 from semfov.fit.windows_decisions import choose_places, search_pictures
@@ -424,6 +424,8 @@ def test_frequencies_are_those_of_all_photographs(fitted):
 def test_what_was_fitted_tells_bright_squares_from_pale_ones(fitted):
     model, eye, report = fitted
     assert f"searches of {COUNT} photographs" in report
+    least = float(model.photograph.at_place(torch.tensor(LEAST_CERTAINTY)).sigmoid())
+    assert model.photograph.thresholds.stop_below == pytest.approx(least, abs=6e-4)
     agent, right = ZoomAgent(eye, model.eval()), []
     for index in range(COUNT):
         there = Photographs().targets(index)

@@ -1046,6 +1046,13 @@ def test_a_photograph_is_not_absent_while_a_closer_look_is_due(detector, photogr
     assert [live.step(photograph).decision.outcome for _ in range(3)] == ["undecided", "undecided", "found"]
 
 
+def test_a_search_of_a_photograph_ends_where_the_class_is_next_to_impossible(detector, photograph):
+    """No chance of a hit is left, however low `stop_below` is."""
+    agent = ZoomAgent(WindowEye(detector), evidence_with_shares())
+    path = agent.search(photograph, "red", SearchSettings(prior=1e-8, stop_below=0.0))
+    assert (path.passes, path.decision.outcome, path.ending) == (1, "absent", "decision")
+
+
 def test_faint_objects_of_a_rare_class_take_no_closer_looks_in_a_photograph(detector, photograph):
     """A prior of one half lifts them over the threshold, but the fit has seen no such places."""
     faint = 0.02 * photograph
