@@ -70,7 +70,7 @@ def _visible_entries(folder: Path, *, recursive: bool) -> list[Path]:
     return [path for path in paths if not _is_hidden(path.relative_to(folder))]
 
 
-def _warn_of_omitted(where: object, paths: Collection[Path], noun: str, why: str) -> None:
+def _warn_of_omitted(where: object, paths: Collection[Path], noun: str, why: str, *, stacklevel: int = 3) -> None:
     """Warn of files or folders that are left out, if there are any, with the names of a few.
 
     Args:
@@ -78,11 +78,12 @@ def _warn_of_omitted(where: object, paths: Collection[Path], noun: str, why: str
         paths: they.
         noun: what each of them is.
         why: they are left out, and what to do.
+        stacklevel: the call that the warning points to, as of `warnings.warn`: that of `picture_files`.
     """
     if paths:
         names = printable(", ".join(map(str, sorted(paths)[:_NAMED])))
         few = "such as " if len(paths) > _NAMED else ""
-        warnings.warn(f"{where}: {amount(len(paths), noun)} left out, {why}: {few}{names}", stacklevel=3)
+        warnings.warn(f"{where}: {amount(len(paths), noun)} left out, {why}: {few}{names}", stacklevel=stacklevel)
 
 
 def _is_hidden(path: Path) -> bool:
@@ -92,7 +93,7 @@ def _is_hidden(path: Path) -> bool:
 def _of_others(files: Sequence[Path], source: Path) -> list[Path]:
     """Drop the figures and crops that semfov has written, with a warning."""
     written = [path for path in files if _is_made_here(path)]
-    _warn_of_omitted(source, written, "picture", "written by semfov (looked at by name)")
+    _warn_of_omitted(source, written, "picture", "written by semfov (looked at by name)", stacklevel=4)
     return [path for path in files if path not in written]
 
 
@@ -122,5 +123,5 @@ def photographs(paths: Sequence[Path], where: str) -> list[Path]:
     # `search`, `find` and `explore` take photographs alone.
     has_videos = any(path.suffix.lower() in VIDEOS for path in foreign_files)
     remedy = " (`semfov live` takes videos)" if has_videos else ""
-    _warn_of_omitted(where, foreign_files, "file", f"of another kind than photographs{remedy}")
+    _warn_of_omitted(where, foreign_files, "file", f"of another kind than photographs{remedy}", stacklevel=4)
     return [path for path in paths if path not in foreign_files]

@@ -21,6 +21,7 @@ from semfov.data.images import _FORMATS
 from semfov.data.picture_files import PHOTOGRAPHS, picture_files
 from semfov.data.sources import open_stream
 from semfov.errors import DataError
+from semfov.io.files import MADE_HERE
 from semfov.report.episode import jpeg
 from tests import small
 from tests.films import encode
@@ -368,3 +369,13 @@ def test_a_stream_that_breaks_off_is_opened_again(monkeypatch):
     assert gaps == {"reconnected": 1, "lost": 0}
     assert [picture.passed for picture in taken[:2]] == [0.04, 0.04]
     assert taken[2].passed > 0.04
+
+
+def test_warnings_of_what_a_folder_leaves_out_point_to_its_caller(tmp_path):
+    for name in ("a.jpg", "b.txt", "c.vrt"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "d.png").write_bytes(MADE_HERE.encode())
+    with pytest.warns(UserWarning, match="left out") as warned:
+        picture_files(tmp_path, recursive=True)
+    assert len(warned) == 3
+    assert {warning.filename for warning in warned} == {__file__}
